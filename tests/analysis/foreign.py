@@ -10,15 +10,7 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.schema.trial import (
-    Clocks,
-    Counts,
-    DeviceRecord,
-    Geometry,
-    Provenance,
-    Quality,
-    TrialRecord,
-)
+from sliplab.storage.schema import trial as schema
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Campaign, Store
 
@@ -73,33 +65,19 @@ def commit_foreign(
     Args:
         origin: its `imported` part, and ``condition``; without ``span_ns`` it gets one second.
     """
-    clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
+    clock = schema.DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     span = origin.get("span_ns", (0, 1_000_000_000))
     writer = campaign.begin(trial, None, 100)
     writer.add_events(events)
-    record = TrialRecord.model_validate(
-        {
-            "format": 1,
-            "trial": trial,
-            "campaign": campaign.name,
-            "experiment": experiment,
-            "role": "imported",
-            "block": 0,
-            "repetition": 0,
-            "attempt": 0,
-            "condition": dict(origin.get("condition", {})),
-            "simulated": simulated,
-            "recorded_s": (span[1] - span[0]) / 1e9,
-            "counts": Counts(events=len(events), frames=0, poses=0, pulses=0),
-            "clocks": Clocks(reference="event camera", events=clock),
-            "quality": Quality(passed=True),
-            "geometry": Geometry(event_px=event_px),
-            "imported": {
-                "format": "adapter",
-                "from": trial,
-                "span_ns": span,
-                **{key: value for key, value in origin.items() if key != "condition"},
-            },
-        }
+    imported = {key: value for key, value in origin.items() if key != "condition"}
+    data = (
+        {"format": 1, "trial": trial, "campaign": campaign.name, "experiment": experiment}
+        | {"role": "imported", "block": 0, "repetition": 0, "attempt": 0, "simulated": simulated}
+        | {"condition": dict(origin.get("condition", {})), "recorded_s": (span[1] - span[0]) / 1e9}
+        | {"counts": schema.Counts(events=len(events), frames=0, poses=0, pulses=0)}
+        | {"clocks": schema.Clocks(reference="event camera", events=clock)}
+        | {"quality": schema.Quality(passed=True), "geometry": schema.Geometry(event_px=event_px)}
+        | {"imported": {"format": "adapter", "from": trial, "span_ns": span, **imported}}
     )
-    writer.commit(record, Provenance.model_validate({"imported": "now", "from": trial}))
+    record = schema.TrialRecord.model_validate(data)
+    writer.commit(record, schema.Provenance.model_validate({"imported": "now", "from": trial}))

@@ -21,98 +21,31 @@ TINY: dict[str, dict[str, Any]] = {
     "clock_kinds": {"trains": 2},
     "labels": {"frames": 5, "runs": 1},
     "orchestration": {"trials": 30, "runs": 1, "records": 50, "starts": 0, "long": 40},
-    "acquisition": {
-        "seconds": 0.5,
-        "events_per_s": 100_000,
-        "size": 96,
-        "pictures": 4,
-        "saturating": 20,
-    },
+    "acquisition": {"seconds": 0.5, "events_per_s": 100_000, "size": 96, "pictures": 4}
+    | {"saturating": 20},
     "fewer": {"worlds": 1, "adaptive": 1, "cores": 1},
     "statements": {"campaigns": 1, "cores": 1},
 }
+FILES = ("write_m_events_per_s", "read_m_events_per_s", "window_30ms_ms", "bytes_per_event")
 PROMISED = {
-    "orchestration": {
-        "loop_ms",
-        "batched_ms",
-        "per_trial_ms",
-        "bluesky_ms",
-        "bluesky_plan_ms",
-        "catalogue_build_s",
-        "catalogue_100k_s",
-        "memory_growth_mb",
-        "server_growth_mb",
-    },
-    "storage": {
-        "write_m_events_per_s",
-        "read_m_events_per_s",
-        "window_30ms_ms",
-        "bytes_per_event",
-        "frames_per_s_800",
-        "pickle_write_m_events_per_s",
-        "pickle_read_m_events_per_s",
-        "pickle_window_30ms_ms",
-        "pickle_bytes_per_event",
-        "aedat4_write_m_events_per_s",
-        "aedat4_read_m_events_per_s",
-        "aedat4_window_30ms_ms",
-        "aedat4_bytes_per_event",
-        "aedat4_own_read_m_events_per_s",
-        "aedat4_own_read_ratio",
-    },
-    "scene": {
-        "contact_8_s",
-        "ns_per_event",
-        "ns_per_event_busy",
-        "x_circuit",
-        "x_circuit_low_pass",
-        "event_time_p95_us",
-        "readout_p95_us",
-    },
-    "clocks": {
-        "worst_error_us",
-        "accepted_share",
-        "wrong_accepted",
-        "fit_ms",
-        "coverage_95",
-        "index_worst_error_us",
-        "nearest_worst_error_us",
-        "pyxdf_worst_error_us",
-    },
-    "clock_kinds": {
-        "good_wrong",
-        "good_refused_share",
-        "good_coverage_95",
-        "other_trial_wrong",
-        "jump_1ms_at_end_wrong",
-        "lost_30_on_both_refused_share",
-        "kink_0.2ppm_coverage_95",
-    },
-    "acquisition": {
-        "frames_lost",
-        "events_lost",
-        "pulses_lost",
-        "memory_growth_mb",
-        "saturation_x_realtime",
-        "encode_s_per_trial",
-        "frames_per_s",
-        "dropped_on_purpose",
-        "dropped_noticed",
-    },
-    "labels": {
-        "x_blob_detector",
-        "x_best_opencv",
-        "centroid_diff_px",
-        "decode_track_x_realtime",
-        "aruco_x_realtime",
-    },
-    "fewer": {
-        "shuffled_worst_claim_wrong_percent",
-        "adaptive_worst_claim_wrong_percent",
-        "shuffled_true_trials_percent",
-        "adaptive_true_trials_percent",
-        "adaptive_over_shuffled",
-    },
+    "orchestration": {"loop_ms", "batched_ms", "per_trial_ms", "bluesky_ms", "bluesky_plan_ms"}
+    | {"catalogue_build_s", "catalogue_100k_s", "memory_growth_mb", "server_growth_mb"},
+    "storage": {f"{kind}{name}" for kind in ("", "pickle_", "aedat4_") for name in FILES}
+    | {"frames_per_s_800", "aedat4_own_read_m_events_per_s", "aedat4_own_read_ratio"},
+    "scene": {"contact_8_s", "ns_per_event", "ns_per_event_busy", "x_circuit"}
+    | {"x_circuit_low_pass", "event_time_p95_us", "readout_p95_us"},
+    "clocks": {"worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95"}
+    | {f"{rival}_worst_error_us" for rival in ("index", "nearest", "pyxdf")},
+    "clock_kinds": {"good_wrong", "good_refused_share", "good_coverage_95", "other_trial_wrong"}
+    | {"jump_1ms_at_end_wrong", "lost_30_on_both_refused_share", "kink_0.2ppm_coverage_95"},
+    "acquisition": {"frames_lost", "events_lost", "pulses_lost", "memory_growth_mb"}
+    | {"saturation_x_realtime", "encode_s_per_trial", "frames_per_s"}
+    | {"dropped_on_purpose", "dropped_noticed"},
+    "labels": {"x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime"}
+    | {"aruco_x_realtime"},
+    "fewer": {f"{way}_worst_claim_wrong_percent" for way in ("shuffled", "adaptive")}
+    | {f"{way}_true_trials_percent" for way in ("shuffled", "adaptive")}
+    | {"adaptive_over_shuffled"},
     "statements": {
         "median of a time, blocks differ by 50 %: wrong_percent",
         "mean of a share, AR(1) of 0.9: held_percent",
@@ -120,14 +53,8 @@ PROMISED = {
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
 }
-
-
-MARKS = {
-    "acquisition": pytest.mark.realtime,
-    "scene": pytest.mark.long,
-    "fewer": pytest.mark.long,
-    "statements": pytest.mark.long,
-}
+MARKS = dict.fromkeys(("scene", "fewer", "statements"), pytest.mark.long)
+MARKS["acquisition"] = pytest.mark.realtime
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
 campaigns."""
 
@@ -170,43 +97,29 @@ def test_rivals_take_turns() -> None:
 
 
 def test_ratios_are_of_pairs() -> None:
-    assert measure.ratio("x", [4.0, 9.0, 2.0], [2.0, 3.0, 2.0]) == {
-        "x": 2.0,
-        "x_min": 1.0,
-        "x_max": 3.0,
-    }
+    found = measure.ratio("x", [4.0, 9.0, 2.0], [2.0, 3.0, 2.0])
+    assert found == {"x": 2.0, "x_min": 1.0, "x_max": 3.0}
 
 
 def a_result(name: str, day: str, **figures: float | None) -> dict[str, Any]:
     machine = {"cpu": "some", "cores": 2, "memory_gb": 8.0, "os": "an OS"}
-    return {
-        "name": name,
-        "figures": figures,
-        "versions": {"python": "3"},
-        "machine": machine,
-        "seed": 1,
-        "day": day,
-    }
+    known = {"versions": {"python": "3"}, "machine": machine, "seed": 1}
+    return {"name": name, "figures": figures, "day": day, **known}
 
 
 def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
     names = ("storage", "scene", "clocks")
     folder, page = tmp_path / "results", tmp_path / "RESULTS.md"
-    first = a_result(
-        "scene", "2026-01-01", a_ms=1.25, a_ms_min=1.0, a_ms_max=2.0, b_mb=1234.5, c_ms=None
-    )
+    figures = {"a_ms": 1.25, "a_ms_min": 1.0, "a_ms_max": 2.0, "b_mb": 1234.5, "c_ms": None}
+    first = a_result("scene", "2026-01-01", **figures)
     kept.keep(first, names, folder, page)
     kept.keep(a_result("storage", "2026-01-02", d=1.0), names, folder, page)
     kept.keep(a_result("clocks", "2026-01-01", e=5.0), names, folder, page)
     text = page.read_text()
-    assert "| a_ms | 1.25 | 1 to 2 |" in text
-    assert "| b_mb | 1,234 |  |" in text
-    assert "| c_ms | - |  |" in text
-    assert [line for line in text.splitlines() if line.startswith("## ")] == [
-        "## storage",
-        "## scene",
-        "## clocks",
-    ]
+    for row in ("| a_ms | 1.25 | 1 to 2 |", "| b_mb | 1,234 |  |", "| c_ms | - |  |"):
+        assert row in text
+    titles = [line for line in text.splitlines() if line.startswith("## ")]
+    assert titles == [f"## {name}" for name in names]
     assert "**Run 1**: 2026-01-02, some, 2 cores" in text
     assert "**Run 2**: 2026-01-01, some, 2 cores" in text
     assert text.index("As run 2.") > text.index("## clocks")

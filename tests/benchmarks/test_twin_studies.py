@@ -13,21 +13,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks import twin_studies
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
-from benchmarks.twin_studies import (
-    ASSUMED,
-    FIGURES,
-    ONSETS,
-    SPLIT,
-    FloatArray,
-    Outcome,
-    beyond,
-    hidden_rig,
-    lines,
-    medians_ms,
-    protocols,
-    within,
-)
+from benchmarks.twin_studies import FIGURES, ONSETS, FloatArray, Outcome, lines, medians_ms, within
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
 from sliplab.analysis.detectors.smoothing_rule import Found
@@ -46,7 +34,10 @@ def test_a_figure_that_is_missing_or_too_far_away_does_not_hold() -> None:
     assert not within(own, {**own, "kinematic": 112.0})["kinematic"]
     spans = {"accuracy": (0.9, 1.2), "gross": None, "kinematic": (0.11, 0.2)}
     spans |= {"gravity": (-0.2, -0.09), "gravity_lead": (-0.3, -0.2)}
-    assert [name for name, far in beyond(spans).items() if far] == ["kinematic", "gravity_lead"]
+    assert [name for name, far in twin_studies.beyond(spans).items() if far] == [
+        "kinematic",
+        "gravity_lead",
+    ]
     studies: dict[str, Any] = {"hidden": {"figures": own}}
     studies["twin"] = {"figures": {**own, "gross": 10.0}, "spans": dict.fromkeys(FIGURES)}
     studies["assumed"] = {"figures": other, "spans": dict.fromkeys(FIGURES) | spans}
@@ -152,10 +143,9 @@ def test_times_count_from_the_onset_that_is_asked_for() -> None:
         Decided(found, {"paper": paper}, 30 * ms),
     ]
     rows: Any = [(SimpleNamespace(trial=name, experiment="kinematic"), None) for name in "ab"]
+    trials = [("tiny", "a"), ("tiny", "b")]
     samples: Any = SimpleNamespace(
-        y=np.array([0, 1, 2, 2]),
-        trial=np.array([0, 0, 0, 1]),
-        trials=[("tiny", "a"), ("tiny", "b")],
+        y=np.array([0, 1, 2, 2]), trial=np.array([0, 0, 0, 1]), trials=trials
     )
     judged = [Judged(np.array([[9, 0, 0], [0, 9, 0], [0, 9, 0], [0, 0, 9]]), samples, rows)]
     by_paper, by_point = (Outcome.of(judged, [decided], onset) for onset in ONSETS)
@@ -199,17 +189,17 @@ def test_figures_are_means_over_networks_and_their_intervals_hold() -> None:
 
 def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     assumed = tmp_path / "assumed.yaml"
-    assumed.write_text(rig_yaml(ASSUMED))
+    assumed.write_text(rig_yaml(twin_studies.ASSUMED))
     base, _ = load_rig_file(assumed)
-    rig, _ = load_rig_file(hidden_rig(tmp_path, assumed, 2, 1))
+    rig, _ = load_rig_file(twin_studies.hidden_rig(tmp_path, assumed, 2, 1))
     world = replace(prior_of(CLEAN, 2), rig=base).world(1, pilot_slides())
     assert rig.scene == world.rig.scene
     assert rig.scene.scene.friction.kinetic != base.scene.scene.friction.kinetic
-    plans = [load_plan(path) for path in protocols(tmp_path, 3, whole_grid=False)]
+    plans = [load_plan(path) for path in twin_studies.protocols(tmp_path, 3, whole_grid=False)]
     assert [len(plan) for plan in plans] == [576, 108, 144]
     counts = Counter(trial.split for trial in plans[0])
-    assert all(abs(counts[name] / 576 - share) < 0.02 for name, share in SPLIT.items())
+    assert all(abs(counts[name] / 576 - share) < 0.02 for name, share in twin_studies.SPLIT.items())
     assert plans[0].protocol.analysis.also is None
     assert plans[0].protocol.analysis.training.seeds == (0, 1, 2)
-    (grid,) = (load_plan(path) for path in protocols(tmp_path, 2, whole_grid=True))
+    (grid,) = (load_plan(path) for path in twin_studies.protocols(tmp_path, 2, whole_grid=True))
     assert Counter(trial.split for trial in grid) == {"train": 605, "validation": 127, "test": 132}

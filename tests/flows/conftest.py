@@ -29,6 +29,9 @@ from sliplab.flows.study import Outcome, study  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
 from sliplab.storage.trials.store import Store  # noqa: E402
 
+Ran = tuple[list[RunRequest], Outcome]
+"""What the fixture `ran` gives: the runs of the small study, and how they ended."""
+
 configure_prefect(Path(_HOME))
 # other tests have the other cores; in a fresh clone the first trial takes that long by its kernels
 parallel_map.START_S = math.inf

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shutil
 from pathlib import Path
 
@@ -30,15 +29,8 @@ from sliplab.storage.schema.classes import ClassSummary
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import answer, here
 from tests.docs.nonsense import check_refusals
-from tests.flows.class_store import (
-    CLASSES,
-    LENGTH_MS,
-    adapter,
-    add_trial,
-    begin_campaign,
-    class_store,
-    events,
-)
+from tests.flows import class_store as made
+from tests.flows.class_store import CLASSES, LENGTH_MS, adapter, begin_campaign, class_store
 
 TRIALS = {"train": 10, "validation": 3, "test": 4}
 
@@ -116,8 +108,7 @@ def test_accuracy_by_length_is_that_of_spikes_so_far(judged: Store) -> None:
     so_far = np.cumsum(np.array(spikes, np.int64), axis=1)  # window, step, class
     step_ms = fitted.windows.step_ms
     rows = found.scores.by_length
-    assert rows[0].ms == step_ms
-    assert rows[-1].ms == LENGTH_MS
+    assert (rows[0].ms, rows[-1].ms) == (step_ms, LENGTH_MS)
     for row in rows:
         counts = so_far[:, row.ms // step_ms - 1]
         top = counts == counts.max(axis=1, keepdims=True)
@@ -132,23 +123,15 @@ def test_counts_of_a_recordings_windows_are_added_up() -> None:
         counts, np.array([0, 0, 0, 1, 2]), np.array([0, 0, 1, 1, 1])
     )
     assert sums.tolist() == [[3, 5, 0], [2, 0, 0], [5, 5, 1], [0, 0, 9]]
-    assert true.tolist() == [0, 0, 1, 2]
-    assert trial.tolist() == [0, 1, 1, 1]
+    assert (true.tolist(), trial.tolist()) == ([0, 0, 1, 2], [0, 1, 1, 1])
 
 
 def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> None:
     folder = judged.folder / "report"
     page = (folder / "index.html").read_text()
-    for text in (
-        "Classification report",
-        "Objects touched by a skin of six taxels",
-        "CC0",
-        "clocks",
-        "How early a class is known",
-        f"sliplab train {judged.folder}",
-        "logistic regression on each",
-        "Guessing gives 20.0 %",
-    ):
+    about = ("Classification report", "Objects touched by a skin of six taxels", "CC0", "clocks")
+    said = ("How early a class is known", "logistic regression on each", "Guessing gives 20.0 %")
+    for text in (*about, *said, f"sliplab train {judged.folder}"):
         assert text in page, text
     assert "simulated" not in page.split("</style>")[1].lower()
     written = read_json(folder / "summary.json")
@@ -178,7 +161,9 @@ def test_nothing_is_made_twice_and_other_methods_join(
     monkeypatch.setattr(baselines, "boosted", boosted)
     campaigns = collected(copied)
     for name in ("label", "train", "evaluate"):
-        assert answer(name, copied.folder)["done"] == 0
+        found = answer(name, copied.folder)
+        assert list(found) == ["step", "done", "fresh"]
+        assert (found["step"], found["done"]) == (name, 0)
     done = window_baselines(copied, campaigns)
     assert done["argmax"].keys() == {"gru"}
     assert (done["done"], done["fresh"]) == (1, 0)
@@ -189,7 +174,7 @@ def test_nothing_is_made_twice_and_other_methods_join(
     assert summary.classes.trained_baselines.keys() == {"gru"}
     assert "gated recurrent unit" in (copied.folder / "report" / "index.html").read_text()
     assert window_baselines(copied, campaigns)["done"] == 0
-    assert answer("report", copied.folder)["done"] == 0
+    assert answer("report", copied.folder) == {"step": "report", "done": 0, "fresh": 1}
 
 
 def test_parts_of_one_recording_may_show_several_classes(tmp_path: Path) -> None:
@@ -198,19 +183,20 @@ def test_parts_of_one_recording_may_show_several_classes(tmp_path: Path) -> None
     rng = np.random.default_rng(2)
     for part, count in TRIALS.items():
         for k in range(count):
-            parts = [events(rng, n, 2, begin_ms=2 * n * LENGTH_MS) for n in (0, 1)]
-            parts.insert(1, events(rng, 0, 2, begin_ms=LENGTH_MS))
+            parts = [made.events(rng, n, 2, begin_ms=2 * n * LENGTH_MS) for n in (0, 1)]
+            parts.insert(1, made.events(rng, 0, 2, begin_ms=LENGTH_MS))
             spans = [(0, 2 * LENGTH_MS, "still"), (2 * LENGTH_MS, 3 * LENGTH_MS, "stroke")]
             chunk = type(parts[0]).joined(parts)
-            add_trial(campaign, f"{part}_{k}", chunk, spans, fields={"part": part}, simulated=True)
+            made.add_trial(
+                campaign, f"{part}_{k}", chunk, spans, fields={"part": part}, simulated=True
+            )
     campaigns = collected(store)
     assert class_names(campaigns) == ("still", "stroke")
     for step in (label, train, evaluate, report):
         step(store, campaigns)  # type: ignore[operator]
     scores = class_evaluation_of(store).scores
-    assert scores.accuracy.n == 3 * TRIALS["test"]
-    assert scores.trials.argmax.n == 2 * TRIALS["test"]
-    assert scores.trials.argmax.trials == TRIALS["test"]
+    each = scores.trials.argmax
+    assert (scores.accuracy.n, each.n, each.trials) == tuple(k * TRIALS["test"] for k in (3, 2, 1))
     page = (store.folder / "report" / "index.html").read_text()
     assert "Every number and figure in this report is simulated." in page
     assert "one or several of them" in page
@@ -255,8 +241,8 @@ def test_what_cannot_be_trained_is_said(
 def test_without_test_recordings_there_are_no_figures(tmp_path: Path) -> None:
     store = class_store(tmp_path / "store", trials={"train": 2, "validation": 1})
     campaigns = collected(store)
-    label(store, campaigns)
-    train(store, campaigns)
+    for name, made_of in (("label", 15), ("train", 2)):
+        assert answer(name, store.folder) == {"step": name, "done": made_of, "fresh": 0}
     with pytest.raises(StoreError, match="there are no test samples"):
         evaluate(store, campaigns)
     with pytest.raises(StoreError, match="nothing evaluated yet; run `sliplab evaluate`"):
@@ -285,12 +271,11 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_belongs_to_slip_says_so_in_one_line(copied: Store, command: str) -> None:
+def test_what_belongs_to_slip_says_so_in_one_line(judged: Store, command: str) -> None:
     code, text = REFUSED[command]
-    done = here(*command.replace("STORE", str(copied.folder)).split())
+    done = here(*command.replace("STORE", str(judged.folder)).split())
     assert done.returncode == code, done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1
+    assert len([line for line in done.stderr.splitlines() if line.startswith("error: ")]) == 1
     assert text in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
 
@@ -315,15 +300,3 @@ def test_more_classes_than_a_byte_counts_are_told_apart_in_the_matrix() -> None:
     assert ">undecided<" in svg
     assert sum(svg.count(f">{name}<") for name in names) <= 2 * NAMED
     assert "simulated" in svg
-
-
-def test_json_of_each_step(tmp_path: Path) -> None:
-    store = class_store(tmp_path / "store", trials={"train": 2, "validation": 1, "test": 1})
-    found = {name: answer(name, store.folder) for name in ("label", "train", "evaluate", "report")}
-    assert found == {
-        "label": {"step": "label", "done": 20, "fresh": 0},
-        "train": {"step": "train", "done": 2, "fresh": 0},
-        "evaluate": {"step": "evaluate", "done": 1, "fresh": 0},
-        "report": {"step": "report", "done": 1, "fresh": 0},
-    }
-    assert json.loads((store.folder / "report" / "summary.json").read_text())["classes"]

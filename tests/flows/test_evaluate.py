@@ -12,11 +12,11 @@ from sliplab.analysis.evaluation.trials import judge, summaries
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import wanted_models
 from sliplab.flows.evaluate import evaluate
-from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import read_summary
-from sliplab.flows.study import Outcome, study
+from sliplab.flows.study import study
 from sliplab.storage.trials.store import Store
-from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
+from tests.flows.conftest import Ran, summary_json, tiny, tiny_gravity, write
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_the_report_shows_every_network(two_seeds: Store) -> None:
     assert len(summary_json(two_seeds)["kinematic"]["by_seed"]) == 2
 
 
-def test_one_network_is_not_shown_twice(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_one_network_is_not_shown_twice(ran: Ran) -> None:
     (run_request, *_), _ = ran
     store = Store.open(run_request.store)
     assert "by_seed" not in summary_json(store)["kinematic"]

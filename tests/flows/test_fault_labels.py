@@ -49,7 +49,6 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Label, Recording]:
 
 def first_slip_s(sound: tuple[Label, Recording]) -> float:
     """Return the first marker's slip time, seconds into the recording."""
-    assert sound[0].onsets.incipient_ns is not None
     return sound[0].onsets.incipient_ns / 1e9
 
 
@@ -83,7 +82,6 @@ def test_without_the_centre_gross_slip_is_unknown(
     tmp_path: Path, sound: tuple[Label, Recording], kind: str
 ) -> None:
     gross = sound[0].onsets.gross_ns
-    assert gross is not None
     fault = {"kind": kind, "papilla": 0, "at_s": gross / 1e9 - 0.2}
     label, recording = one_slide(tmp_path, [fault])
     kept = label.document().to_json()
@@ -120,7 +118,6 @@ def one_fall(folder: Path, faults: list[dict[str, Any]]) -> tuple[Label, Recordi
 def test_a_plate_that_is_stuck_gives_no_gross_slip(tmp_path: Path) -> None:
     label, recording = one_fall(tmp_path, [{"kind": "plate_stuck"}])
     truth = recording.simulation_truth()
-    assert truth is not None
     assert truth["gross_ns"] is None
     assert label.document().gross_ns is None
     assert label.doubts.gross is None  # it is known that there was none

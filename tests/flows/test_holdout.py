@@ -15,29 +15,22 @@ from sliplab.analysis.evaluation.holdout import Holdout
 from sliplab.analysis.report.holdout import holdout_part, holdout_rows
 from sliplab.analysis.report.programs import HOLDOUT
 from sliplab.flows import holdout
-from sliplab.flows.holdout import (
-    PROTOCOL_SEED,
-    SKIN_SEED,
-    holdout_request,
-    measure_holdout,
-)
+from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, holdout_request, measure_holdout
 from sliplab.flows.label import label
-from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
-from sliplab.flows.study import Outcome
 from sliplab.plugins.studies.generalise import run as generalise
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
-from tests.flows.conftest import shape_of, summary_json
+from tests.flows.conftest import Ran, shape_of, summary_json
 
 SEEDS = (5, 6)
 """Not the release's: no test may look at its trials."""
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, with four trials held out."""
     folder = tmp_path_factory.mktemp("holdout") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -132,44 +125,19 @@ def test_the_file_has_these_keys(store: Store) -> None:
     path = store.folder / "holdout/results.json"
     assert json_text(HoldoutResult.load(path).to_json()) == path.read_text()
     found = shape_of(read_json(path))
-    assert list(found) == [
-        "evaluations",
-        "false_alarms",
-        "key",
-        "kinematic",
-        "model",
-        "protocol_seed",
-        "rows",
-        "simulated",
-        "skin_seed",
-        "trials",
-        "windows",
-    ]
-    assert found["evaluations"] == [
-        {"at": "str", "model": "str", "strict": "float", "version": "str"}
-    ]
-    assert found["windows"] == {
-        "accuracy": {"argmax": "float", "margin": "float", "n": "int", "strict": "float"},
-        "argmax": SHARE,
-        "balance": BY_CLASS,
-        "confusion": [["int"]],
-        "precision": BY_CLASS,
-        "recall": BY_CLASS,
-        "strict": SHARE,
-    }
+    names = {"evaluations", "false_alarms", "key", "kinematic", "model", "protocol_seed", "rows"}
+    assert list(found) == sorted(names | {"simulated", "skin_seed", "trials", "windows"})
+    line = {"at": "str", "model": "str", "strict": "float", "version": "str"}
+    assert found["evaluations"] == [line]
+    accuracy = {"argmax": "float", "margin": "float", "n": "int", "strict": "float"}
+    assert found["windows"] == (
+        {"accuracy": accuracy, "argmax": SHARE, "strict": SHARE, "confusion": [["int"]]}
+        | dict.fromkeys(("balance", "precision", "recall"), BY_CLASS)
+    )
     assert list(found["kinematic"]) == ["latency_ms", "lead_ms", "trials", "without_onsets"]
-    assert list(found["rows"][0]) == [
-        "campaign",
-        "condition",
-        "detected_gross_ns",
-        "detected_incipient_ns",
-        "end_ns",
-        "experiment",
-        "gross_ns",
-        "incipient_ns",
-        "latency",
-        "trial",
-    ]
+    times = {f"{name}_ns" for kind in ("incipient", "gross") for name in (kind, f"detected_{kind}")}
+    names = {"campaign", "condition", "end_ns", "experiment", "latency", "trial"}
+    assert list(found["rows"][0]) == sorted(names | times)
     numbers = ("key", "model", "protocol_seed", "simulated", "skin_seed", "trials")
     types = ["str", "str", "int", "bool", "int", "int"]
     assert [found[name] for name in numbers] == types

@@ -69,7 +69,6 @@ def label(recording: Recording, data: dict[str, Any]) -> Label:
 def errors_ms(found: Label, recording: Recording) -> list[float]:
     """Incipient and gross onset against the simulation's truth."""
     truth = recording.simulation_truth()
-    assert truth is not None
     pairs = [
         (found.onsets.incipient_ns, truth["incipient_ns"]),
         (found.onsets.gross_ns, truth["gross_ns"]),
@@ -109,8 +108,6 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         (video.onsets.incipient_ns, tracks.onsets.incipient_ns),
         (video.onsets.gross_ns, tracks.onsets.gross_ns),
     ):
-        assert a is not None
-        assert b is not None
         # the same frame, or the next one where a twentieth of a pixel decides
         assert abs(a - b) / 1e6 <= 1.05 * FRAME_MS
     assert abs(video.end_ns - tracks.end_ns) / 1e6 <= 1.05 * FRAME_MS
@@ -125,7 +122,6 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         fastest = int(np.hypot(*np.diff(places, axis=0).T).argmax())
         after = (found.end_ns - int(found.frame_ns[fastest])) / 1e6
         assert 0 < after <= 2.05 * FRAME_MS
-        assert found.onsets.gross_ns is not None
         assert found.onsets.gross_ns < found.end_ns < recording.step("retract")[1]
 
 

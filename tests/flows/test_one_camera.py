@@ -35,10 +35,15 @@ __all__ = ["installed"]  # a fixture
 pytestmark = pytest.mark.programs
 
 
-def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
-    """Three slides and two plates, from protocol to report."""
+def rig_with(camera: str, folder: Path) -> Path:
+    """The rig for rehearsals with one camera."""
     rig = yaml.safe_load((ROOT / "rigs" / "rehearsal.yaml").read_text())
     rig["extends"] = str(ROOT / "rigs" / rig["extends"])
+    return write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
+
+
+def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
+    """Three slides and two plates, from protocol to report."""
     slides = tiny()
     slides["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
     slides["analysis"]["split"] = {
@@ -47,20 +52,18 @@ def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
         "test_levels": {"direction": ["240 deg"]},
     }
     slides["analysis"].setdefault("training", {})["seeds"] = [0, 1] if camera == "frames" else [0]
-    path = write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
     protocols = [
         write(folder / "tiny.yaml", slides),
         write(folder / "tiny_gravity.yaml", tiny_gravity()),
     ]
+    path = rig_with(camera, folder)
     requests = [make_request(protocol, path, folder / "store") for protocol in protocols]
     outcome = study(requests, check=2, holdout=3)
     return Store.open(requests[0].store), outcome
 
 
 @pytest.fixture(scope="module")
-def studied(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[str], tuple[Store, Outcome]]:
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Store, Outcome]]:
     """The study of each camera, made when it is first asked for."""
     return cache(lambda camera: take(camera, tmp_path_factory.mktemp(camera)))
 
@@ -94,7 +97,6 @@ def test_a_study_with_one_camera_runs_to_its_report(
     assert {"train", "evaluate", "holdout"} <= states.keys()
 
     summary = read_one_camera(store)
-    assert summary is not None
     assert (summary.simulated, summary.one_camera) == (True, camera)
     assert summary.quality.committed == 5
     assert summary.labels is not None
@@ -104,33 +106,25 @@ def test_a_study_with_one_camera_runs_to_its_report(
     assert "Every number and figure in this report is simulated." in page
     assert "What this report leaves out" in page
     assert "Accuracy of the labels" in page
+    assert left_out == []
     if camera == "events":
-        assert left_out == []
         assert summary.labels.source == {"video": 0, "tracks": 0, "events": 5}
         errors = summary.labels.error_ms
         assert (errors.incipient.n, errors.gross.n) == (3, 3)
         assert max(errors.incipient.max_abs or 0.0, errors.gross.max_abs or 0.0) < 100
         assert "the plate moves by itself" in page
-        assert summary.kinematic is not None
         assert summary.kinematic.accuracy.n > 50
         assert summary.kinematic.latency_ms.incipient.n >= 0
-        assert summary.gravity is not None
         assert summary.gravity.accounted.without_onsets == 2
         assert summary.kinematic.work is not None
         assert "Window accuracy" in page or "window accuracy" in page
-        assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         for rate in (summary.event_rates or {}).values():
-            assert rate.hold is not None
-            assert rate.motion is not None
             assert rate.motion > rate.hold > 0
         assert "Onsets of slip are read from the events of the" in page
         assert (store.folder / "report" / "figures" / "event-rates.svg").exists()
     else:
-        assert left_out == []
         assert summary.classifier is not None
-        assert summary.kinematic is not None
         assert summary.kinematic.samples.test > 50
-        assert summary.kinematic.accuracy.strict is not None
         assert summary.kinematic.accuracy.strict > 0.8
         assert summary.kinematic.work is None
         assert len(summary.trials) == 3
@@ -143,12 +137,11 @@ def test_a_study_with_one_camera_runs_to_its_report(
             assert f"{chosen.seed}, shown above" in page
         assert "The classifier on marker displacements" in page
         assert "no clock lies between them" in page
-        assert (store.folder / "report" / "figures" / "confusion.svg").exists()
         assert summary.labels.error_ms.incipient.n == 5
-        assert summary.labels.error_ms.incipient.max_abs is not None
         assert summary.labels.error_ms.incipient.max_abs < 25
         assert "Top: frames a second." in page
     assert "spiking network and its detectors" in page or camera == "events"
+    assert (store.folder / "report" / "figures" / "confusion.svg").exists()
 
 
 def test_sections_of_other_packages_stand_in_the_report(
@@ -217,13 +210,9 @@ def test_a_report_on_events_says_which_steps_are_still_to_do(taken: Take) -> Non
 def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     """Of frames, the time to the first slip; there is no rate of events."""
     slides = tiny()
-    slides["collection"]["references"] = {
-        "every": 2,
-        "condition": {"depth": 2.4, "speed": 1.6, "direction": 0},
-    }
-    rig = yaml.safe_load((ROOT / "rigs" / "rehearsal.yaml").read_text())
-    rig["extends"] = str(ROOT / "rigs" / rig["extends"])
-    path = write(tmp_path / "rig.yaml", {**rig, "name": "frames", "cameras": ["frames"]})
+    condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
+    slides["collection"]["references"] = {"every": 2, "condition": condition}
+    path = rig_with("frames", tmp_path)
     request = make_request(write(tmp_path / "tiny.yaml", slides), path, tmp_path / "store")
     collect(request)
     store = Store.open(request.store)
@@ -231,7 +220,6 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     label(store, campaigns)
     report(store, campaigns)
     summary = read_one_camera(store)
-    assert summary is not None
     found = summary.references["tiny"]
     assert len(found.trials) >= 3
     assert all(trial.hold_events_per_s is None for trial in found.trials)

@@ -24,9 +24,7 @@ from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.judge_network import judge_model
-from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
-from sliplab.flows.study import Outcome
 from sliplab.flows.train import train
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
@@ -34,11 +32,11 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
-from tests.flows.conftest import summary_json
+from tests.flows.conftest import Ran, summary_json
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study."""
     folder = tmp_path_factory.mktemp("others") / "store"
     shutil.copytree(ran[0][0].store, folder)

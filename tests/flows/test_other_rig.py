@@ -6,14 +6,11 @@ from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.other_rig import other_request
-from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome
 from sliplab.storage.trials.store import Store
+from tests.flows.conftest import Ran
 
 
-def test_only_what_is_asked_for_differs(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path
-) -> None:
+def test_only_what_is_asked_for_differs(ran: Ran, tmp_path: Path) -> None:
     (first, _), _ = ran
     (item,) = collected(Store.open(first.store), [first.campaign])
     change = {"mock": {"scene": {"skin": {"seed": 77}}}}

@@ -65,18 +65,16 @@ def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
             return "" if time_ns is None else f"{int(clock.to_device(time_ns)) / 1000:.3f}"
 
         start, end = recording.motion_ns
-        rows.append(
-            {
-                "trial": f"slide {len(rows) + 1}",
-                "file": Path(file).name,
-                "direction": item.describe(trial)["direction"].split()[0],
-                "part": trial.split,
-                "incipient_us": camera_us(label.incipient_ns),
-                "gross_us": camera_us(label.gross_ns),
-                "start_us": camera_us(start),
-                "end_us": camera_us(end),
-            }
-        )
+        times = {
+            "incipient": label.incipient_ns,
+            "gross": label.gross_ns,
+            "start": start,
+            "end": end,
+        }
+        direction = item.describe(trial)["direction"].split()[0]
+        about = {"trial": f"slide {len(rows) + 1}", "file": Path(file).name, "part": trial.split}
+        known = {f"{name}_us": camera_us(time) for name, time in times.items()}
+        rows.append({**about, "direction": direction, **known})
     pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
 
 

@@ -7,6 +7,7 @@ import csv
 import json
 import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,70 +16,57 @@ import pytest
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
-from sliplab.analysis.report import campaign
+from sliplab.analysis.report import campaign, outcomes
 from sliplab.analysis.report.against import Change, compare
-from sliplab.analysis.report.outcomes import (
-    MOST_FAILURES,
-    OUTCOMES,
-    Conditions,
-    account,
-    failure_section,
-    trial_intervals,
-    trial_outcome,
-)
+from sliplab.analysis.report.outcomes import MOST_FAILURES, account, failure_section, trial_outcome
 from sliplab.analysis.report.page import render_section, write_figures
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
-from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import read_summary, report
-from sliplab.flows.study import Outcome
 from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
 from sliplab.plugins.studies.generalise.section import skin_section
 from sliplab.plugins.studies.section import RESULT as DETECTOR
 from sliplab.plugins.studies.section import tradeoff_section
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedTimes, TrialScore
-from sliplab.storage.schema.summary import ReferenceTrial, Summary, TrialOutcome
+from sliplab.storage.schema.summary import ReferenceTrial, Summary
 from sliplab.storage.trials.store import Store, StoreError
 from tests.analysis.report.test_plugin_sections import install
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
-from tests.flows.conftest import write
+from tests.flows.conftest import Ran, write
 from tests.protocols.test_plugin import installed
 
 __all__ = ["installed"]  # a fixture
 Json = dict[str, Any]
-UNITLESS = {
-    "trial",
-    "name",
-    "row",
-    "class",
-    "detector",
-    "stride",
-    "true class",
-    "tightest gate",
-    "windows",
-    "failed attempts",
-    "place in the plan",
-    "epoch",
-    "side",
-    "simulated",
-    "family",
-    "variant",
-    "on the front",
-    "precision",
-    "width",
-}
+ONSETS = ("incipient", "gross")
+UNITLESS = re.compile(
+    "trial|name|row|class|detector|stride|true class|tightest gate|windows|failed attempts|side|"
+    "place in the plan|epoch|simulated|family|variant|on the front|precision|width"
+)
+"""Headings of columns without a unit."""
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, with its report."""
     folder = tmp_path_factory.mktemp("report") / "store"
     shutil.copytree(ran[0][0].store, folder)
     found = Store.open(folder)
     report(found, collected(found))
     return found
+
+
+@pytest.fixture
+def copied(store: Store, tmp_path: Path) -> Store:
+    """A copy of it, to be changed at will."""
+    return Store.open(shutil.copytree(store.folder, tmp_path / "store"))
+
+
+def changed(of: Any, **values: Any) -> Any:
+    """The same with other values."""
+    return of.model_copy(update=values)
 
 
 def page(store: Store) -> str:
@@ -91,7 +79,7 @@ def test_every_trial_is_counted_once(store: Store) -> None:
         found = getattr(summary, experiment)
         accounts, lead = found.accounted, found.lead_ms
         assert accounts.planned == planned
-        assert sum(accounts.of(name) for name in OUTCOMES) == planned
+        assert sum(accounts.of(name) for name in outcomes.OUTCOMES) == planned
         for name in ("detected_first", "missed", "false_early", "late"):
             assert accounts.of(name) == getattr(lead, name)
     assert [row.campaign for row in summary.trials].count("tiny") == 2
@@ -119,49 +107,42 @@ def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
     assert (missing.planned, missing.not_taken) == (2, 2)
 
 
-FOUND = {
-    "latency_incipient_ms": 90.0,
-    "latency_gross_ms": 40.0,
-    "lead_ms": 900.0,
-    "missed_incipient": False,
-    "missed_gross": False,
-    "false_early_incipient": False,
-    "false_early_gross": False,
-    "late_incipient_ms": None,
-    "late_gross_ms": None,
-}
+FOUND = (
+    {"latency_incipient_ms": 90.0, "latency_gross_ms": 40.0, "lead_ms": 900.0}
+    | dict.fromkeys(("late_incipient_ms", "late_gross_ms"))
+    | dict.fromkeys((f"{x}_{y}" for x in ("missed", "false_early") for y in ONSETS), False)
+)
 
 
 def judged(**changed: Any) -> TrialScore:
     """An evaluated trial."""
-    row = {
-        "campaign": "g",
-        "experiment": "gravity",
-        "trial": "t",
-        "condition": {},
-        "incipient_ns": 10**9,
-        "gross_ns": 2 * 10**9,
-        "end_ns": 3 * 10**9,
-        "detected_incipient_ns": 1,
-        "detected_gross_ns": 2,
-        "latency": {**FOUND, **changed},
-    }
+    row = (
+        {"campaign": "g", "experiment": "gravity", "trial": "t", "condition": {}}
+        | {"incipient_ns": 10**9, "gross_ns": 2 * 10**9, "end_ns": 3 * 10**9}
+        | {"detected_incipient_ns": 1, "detected_gross_ns": 2, "latency": {**FOUND, **changed}}
+    )
     return TrialScore.model_validate(row)
 
 
 def test_what_became_of_a_trial() -> None:
-    assert trial_outcome(judged()).outcome == "detected_first"
     assert trial_outcome(judged()).duration_ms == 1000.0
-    assert trial_outcome(judged(late_incipient_ms=20.0, lead_ms=None)).outcome == "late"
-    late = trial_outcome(judged(late_gross_ms=299.0, latency_gross_ms=None))
-    assert (late.gross, late.late_gross_ms) == ("late", 299.0)
-    assert trial_outcome(judged(missed_incipient=True)).outcome == "missed"
-    assert trial_outcome(judged(false_early_incipient=True)).outcome == "false_early"
-    assert trial_outcome(judged(false_early_gross=True)).gross == "false_early"
-    assert trial_outcome(judged(missed_gross=True)).gross == "missed"
-    none = trial_outcome(judged().model_copy(update={"latency": None, "gross_ns": None}))
+    for values, outcome, gross in (
+        ({}, "detected_first", "detected"),
+        ({"late_incipient_ms": 20.0, "lead_ms": None}, "late", "detected"),
+        ({"late_gross_ms": 299.0, "latency_gross_ms": None}, "detected_first", "late"),
+        ({"missed_incipient": True}, "missed", "detected"),
+        ({"false_early_incipient": True}, "false_early", "detected"),
+        ({"false_early_gross": True}, "detected_first", "false_early"),
+        ({"missed_gross": True}, "detected_first", "missed"),
+    ):
+        found = trial_outcome(judged(**values))
+        assert (found.outcome, found.gross) == (outcome, gross), values
+        assert found.late_gross_ms == values.get("late_gross_ms")
+    none = trial_outcome(changed(judged(), latency=None, gross_ns=None))
     assert (none.outcome, none.gross, none.lead_ms) == ("without_onsets", "without_onsets", None)
-    found = trial_intervals([trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none])
+    found = outcomes.trial_intervals(
+        [trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none]
+    )
     assert found.lead_ms.n == 2
     half = 12.7062047 * 50  # Student's t of two trials
     assert found.lead_ms.mean == pytest.approx([950 - half, 950 + half])
@@ -170,19 +151,25 @@ def test_what_became_of_a_trial() -> None:
 def test_trials_stand_under_their_conditions(store: Store) -> None:
     campaigns = collected(store)
     rows = evaluation_of(store).trials
-    found = Conditions(campaigns, rows, "gravity")
+    found = outcomes.Conditions(campaigns, rows, "gravity")
     cells = found.cells(list(found.factors))
     assert sum(map(len, cells.values())) == 2
     for name, trials in cells.items():
         levels = dict(zip(found.factors, name.split(", "), strict=True))
         assert trials == found.at(**levels)
-    both = Conditions(campaigns, rows, "kinematic")
+    both = outcomes.Conditions(campaigns, rows, "kinematic")
     assert both.varied() == ["direction"]
     assert both.breaks(["direction"]) == []
     assert len(both.at(direction="240 deg")) == 1
     both.factors = {"a": ["1", "2"], "b": ["x", "y", "z"]}
     assert list(both.cells(["a", "b"])) == ["1, x", "1, y", "1, z", "2, x", "2, y", "2, z"]
     assert both.breaks(["a", "b"]) == [3]
+
+
+DRAWN = (
+    *("trial", "confusion", "outputs", "latency-kinematic", "gravity-incipient", "gravity-gross"),
+    *("labels", "clocks", "quality-tiny"),
+)
 
 
 def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
@@ -192,17 +179,7 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
     assert len(names) == text.count("<figure") == len(set(names))
     assert sorted(path.stem for path in (folder / "figures").iterdir()) == sorted(names)
     assert sorted(path.stem for path in (folder / "data").iterdir()) == sorted(names)
-    assert {
-        "trial",
-        "confusion",
-        "outputs",
-        "latency-kinematic",
-        "gravity-incipient",
-        "gravity-gross",
-        "labels",
-        "clocks",
-        "quality-tiny",
-    } <= set(names)
+    assert set(DRAWN) <= set(names)
     for name in names:
         svg = (folder / "figures" / f"{name}.svg").read_text()
         assert svg in text
@@ -211,7 +188,7 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
         assert rows
         assert all(row[-1] == "yes" for row in rows)
         for heading in head:
-            assert heading in UNITLESS or re.search(r"\(.+\)$", heading), (name, heading)
+            assert UNITLESS.fullmatch(heading) or re.search(r"\(.+\)$", heading), (name, heading)
     lines = (folder / "data" / "gravity-incipient.csv").read_text().splitlines()
     known = {row.trial: row for row in read_summary(store).trials}
     for line in csv.DictReader(lines):
@@ -220,21 +197,19 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
 
 
 def test_sections_of_other_packages_stand_in_the_report(
-    installed: Any, store: Store, tmp_path: Path
+    installed: Any, copied: Store, tmp_path: Path
 ) -> None:
-    shutil.copytree(store.folder, tmp_path / "store")
-    other = Store.open(tmp_path / "store")
     install(installed, tmp_path, "lab_rubs")
     install(installed, tmp_path, "lab_bad", ('"rubs"', '"bad"'), ("return Rubs()", "return 1 / 0"))
-    assert report(other, collected(other))["done"] == 1
-    assert report(other, collected(other))["done"] == 0
-    text = page(other)
+    assert report(copied, collected(copied))["done"] == 1
+    assert report(copied, collected(copied))["done"] == 0
+    text = page(copied)
     titles = re.findall(r'<li><a href="#s\d+">([^<]+)</a>', text)
     place = titles.index("Quality and retakes over the campaigns, and wear")
     assert titles[place - 2 : place] == ["Rubs", "Sections that could not be made"]
     assert "<p>7 rubs, simulated</p>" in text
     assert "<p>bad: ZeroDivisionError: division by zero</p>" in text
-    data = other.folder / "report" / "data" / "rubs-force.csv"
+    data = copied.folder / "report" / "data" / "rubs-force.csv"
     assert data.read_text().splitlines() == ["force (N),simulated", "1,yes", "2,yes"]
 
 
@@ -247,18 +222,15 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
             assert f'id="{address[1:]}"' in text
         else:
             assert (folder / address).is_file()
-    assert "88 ms after onset" in text
-    assert "measured by its authors on their own robot" in text
-    assert "here (simulated)" in text
-    assert f"sliplab review {store.folder.resolve()}" in text
-    assert "no campaign has reference trials" in text
-    assert f"sliplab generalise {store.folder.resolve()}" in text
+    for said in (
+        *("88 ms after onset", "measured by its authors on their own robot", "here (simulated)"),
+        *(f"sliplab {command} {store.folder.resolve()}" for command in ("review", "generalise")),
+        "no campaign has reference trials",
+    ):
+        assert said in text
 
 
 def test_failures_have_a_command_that_shows_them(store: Store) -> None:
-    def changed(of: TrialOutcome, **values: str) -> TrialOutcome:
-        return of.model_copy(update=values)
-
     first = read_summary(store).trials[0]
     row = changed(first, trial="a=1,r=1", outcome="late", gross="missed")
     early = changed(row, outcome="detected_first", gross="false_early", campaign="b")
@@ -274,17 +246,13 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     assert len(many.table.rows) == MOST_FAILURES
     assert "summary.json" in render_section(many, simulated=True)[1]
     late = [
-        row.model_copy(
-            update={"outcome": "detected_first", "gross": "late", "late_gross_ms": late_ms}
-        )
+        changed(row, outcome="detected_first", gross="late", late_gross_ms=late_ms)
         for late_ms in (359.0, 579.4)
     ]
     grouped = failure_section(store.folder, late)  # one cause, each by how much in its own row
     assert grouped.causes == [("gross late", 2)]
-    assert [line[1].split(", ")[1] for line in grouped.table.rows] == [
-        "359 ms after it ended",
-        "579 ms after it ended",
-    ]
+    said = [line[1].split(", ")[1] for line in grouped.table.rows]
+    assert said == [f"{late_ms} ms after it ended" for late_ms in (359, 579)]
     none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
     assert "0 of 1 evaluated trials failed in some way." in none
     assert "<table" not in none
@@ -292,45 +260,23 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
 
 def detector() -> Json:
     """Numbers of the shape that the report's section on trade-offs reads."""
+    work = {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]}
+    test = {"strict": [0.9, 0.92], "p95_ms": [200.0, 210.0], "lost_either": [0.0, 0.0]}
+    test["false_early_either"] = [0.0, 0.01]
     rows = [
-        {
-            "length_ms": 30,
-            "step_ms": 1,
-            "pool_px": 20,
-            "width": 1.0,
-            "precision": "as trained",
-            "stride_ms": 30,
-            "smoothing": 4,
-            "margin": 2.0,
-            "front": paper,
-            "paper": paper,
-            "test": {
-                "strict": [0.9, 0.92],
-                "mean_ms": [90.0, late],
-                "p95_ms": [200.0, 210.0],
-                "false_early_either": [0.0, 0.01],
-                "lost_either": [0.0, 0.0],
-            },
-            "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]},
-        }
+        {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "stride_ms": 30}
+        | {"precision": "as trained", "smoothing": 4, "margin": 2.0, "front": paper}
+        | {"paper": paper, "test": {**test, "mean_ms": [90.0, late]}, "work": work}
         for paper, late in ((True, 100.0), (False, None))
     ]
     return {"simulated": True, "rows": rows}
 
 
 @pytest.mark.long
-def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
-    shutil.copytree(store.folder, tmp_path / "store")
-    other = Store.open(tmp_path / "store")
-    skin = {
-        "share": 0.8,
-        "low": 0.7,
-        "high": 0.9,
-        "n": 100,
-        "trials": 4,
-        "argmax": 0.81,
-        "recall": {"no_slip": 0.8, "incipient": 0.8, "gross": None},
-    }
+def test_results_of_other_programs_are_taken_up(copied: Store) -> None:
+    other = copied
+    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81}
+    skin["recall"] = {"no_slip": 0.8, "incipient": 0.8, "gross": None}
     results = {
         "skin 101": skin,
         "depth 2.4 mm": {**skin, "seen": 0.9},
@@ -373,18 +319,15 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     assert list(data.iterdir()) == []  # an older report's figures go
 
 
-def test_an_evaluation_of_another_version_is_refused_by_name(store: Store, tmp_path: Path) -> None:
-    shutil.copytree(store.folder, tmp_path / "store")
-    other = Store.open(tmp_path / "store")
-    path = other.folder / "derived" / "evaluation" / "evaluation.json"
+def test_an_evaluation_of_another_version_is_refused_by_name(copied: Store) -> None:
+    path = copied.folder / "derived" / "evaluation" / "evaluation.json"
     write_json(path, {**read_json(path), "format": [1, 1]})
     with pytest.raises(StoreError, match=r"another version.*sliplab evaluate"):
-        report(other, collected(other))
+        report(copied, collected(copied))
 
 
-def test_an_evaluation_without_figures_by_each_onset_is_shown(store: Store, tmp_path: Path) -> None:
-    shutil.copytree(store.folder, tmp_path / "store")
-    older = Store.open(tmp_path / "store")
+def test_an_evaluation_without_figures_by_each_onset_is_shown(copied: Store) -> None:
+    older = copied
     path = older.folder / "derived" / "evaluation" / "evaluation.json"
     kept = read_json(path)
     for entry in (kept["detectors"] or {"detectors": []})["detectors"]:
@@ -404,31 +347,23 @@ def test_an_evaluation_without_figures_by_each_onset_is_shown(store: Store, tmp_
 
 
 def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
+    times = [None if k else 900.0 for k in range(8)]
     rows = [
         ReferenceTrial(
-            trial=str(k),
-            place=1 + 10 * k,
-            hold_events_per_s=1000.0 + 2 * k,
-            first_slip_ms=None if k else 900.0,
+            trial=f"{k}", place=1 + 10 * k, hold_events_per_s=1e3 + 2 * k, first_slip_ms=time
         )
-        for k in range(8)
+        for k, time in enumerate(times)
     ]
     found = campaign.wear(rows)
     slope = found["hold_events_per_s"].percent_per_100_trials
     assert slope == pytest.approx(100 * 20.0 / 1007.0)
     assert found["hold_events_per_s"].low == pytest.approx(slope)
-    assert found["first_slip_ms"].to_json() == {
-        "n": 1,
-        "percent_per_100_trials": None,
-        "low": None,
-        "high": None,
-    }
+    no_trend = dict.fromkeys(("percent_per_100_trials", "low", "high"))
+    assert found["first_slip_ms"].to_json() == {"n": 1, **no_trend}
     data = short()
     data["collection"]["factors"]["direction"]["values"] = [0, 120]
-    data["collection"]["references"] = {
-        "every": 1,
-        "condition": {"depth": 2.4, "speed": 1.6, "direction": 0},
-    }
+    condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
+    data["collection"]["references"] = {"every": 1, "condition": condition}
     data["collection"]["maintenance"]["rezero"]["touches"] = 3
     run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
     collect(run_request)
@@ -451,23 +386,13 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     zeros = [record.depth_zero_mm or 0.0 for record in records]
     sds = list(dict.fromkeys(record.depth_zero_sd_mm or 0.0 for record in records))
     sd = (sum(sd**2 for sd in sds) / len(sds)) ** 0.5
-    assert section.tables[0].rows == [
-        [
-            "tiny",
-            str(len(sds)),
-            "3",
-            f"{zeros[0]:+.3f}",
-            f"{zeros[-1]:+.3f}",
-            f"{min(zeros):+.3f}",
-            f"{max(zeros):+.3f}",
-            f"{sd:.3f}",
-            f"{sd / 3**0.5:.3f}",
-        ]
-    ]
+    shown = [f"{x:+.3f}" for x in (zeros[0], zeros[-1], min(zeros), max(zeros))]
+    row = ["tiny", str(len(sds)), "3", *shown, f"{sd:.3f}", f"{sd / 3**0.5:.3f}"]
+    assert section.tables[0].rows == [row]
     assert 0.0 < sd < 0.05
     words = "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
     assert words in render_section(section, simulated=True)[1]
-    steep = {"tiny": known["tiny"].model_copy(update={"wear": found})}
+    steep = {"tiny": changed(known["tiny"], wear=found)}
     said = render_section(campaign.quality_section([item], steep, simulated=True), simulated=True)
     trend = f"changes by {slope:+.2f} % in 100 trials"
     assert trend in " ".join(said[1].split())
@@ -492,85 +417,68 @@ def several_seeds(summary: Summary, *shares: tuple[float, float]) -> Summary:
         )
         for k, (share, margin) in enumerate(shares)
     )
-    kinematic = summary.kinematic.model_copy(update={"seeds": Seeds(each=each, spread={})})
-    return summary.model_copy(update={"kinematic": kinematic})
+    return changed(summary, kinematic=changed(summary.kinematic, seeds=Seeds(each=each, spread={})))
+
+
+def gravity_trials(summary: Summary, values: Iterable[Json]) -> Summary:
+    """The same with these gravity trials, 40 of them."""
+    first = next(row for row in summary.trials if row.experiment == "gravity")
+    rows = (changed(first, trial=str(k), **value) for k, value in enumerate(values))
+    return changed(summary, trials=tuple(rows))
 
 
 def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store) -> None:
     summary = read_summary(store)
-    (first, *_) = [row for row in summary.trials if row.experiment == "gravity"]
     rng = np.random.default_rng(1)
     ours, theirs = (
-        summary.model_copy(
-            update={
-                "trials": tuple(
-                    first.model_copy(
-                        update={
-                            "trial": str(k),
-                            "outcome": "detected_first",
-                            "gross": "detected",
-                            "latency_incipient_ms": late + noise,
-                            "latency_gross_ms": 50.0 + 400 * noise,
-                            "lead_ms": None if k == 3 else 900.0 - noise,
-                        }
-                    )
-                    for k, noise in enumerate(rng.normal(0, 10, 40))
-                )
-            }
+        gravity_trials(
+            summary,
+            (
+                {"outcome": "detected_first", "gross": "detected", "latency_incipient_ms": late + x}
+                | {"latency_gross_ms": 50.0 + 400 * x, "lead_ms": None if k == 3 else 900.0 - x}
+                for k, x in enumerate(rng.normal(0, 10, 40))
+            ),
         )
         for late in (120.0, 80.0)
     )
     ours = several_seeds(ours, (0.9, 0.8))
     theirs = several_seeds(theirs, *((share, share) for share in (0.88, 0.90, 0.91)))
-    theirs = theirs.model_copy(update={"versions": {**theirs.versions, "numpy": "0"}})
+    theirs = changed(theirs, versions={**theirs.versions, "numpy": "0"})
     found = {row.name: row for row in compare(ours, theirs).figures}
-    late = found["gravity: incipient latency, mean"]
+    mean = "gravity: incipient latency, mean"
+    late = found[mean]
     assert (late.basis, late.beyond) == ("same trials", True)
-    assert late.low is not None
     assert late.high is not None
     assert late.low < late.difference < late.high
     assert late.difference == pytest.approx(40.0, abs=6)
     assert found["gravity: gross latency, mean"].beyond is False
-    assert found["accuracy, strict, mean of seeds"].basis == "seeds"
-    assert found["accuracy, strict, mean of seeds"].beyond is False
+    strict = found["accuracy, strict, mean of seeds"]
+    assert (strict.basis, strict.beyond) == ("seeds", False)
     assert found["accuracy, margin, mean of seeds"].beyond is True
     assert compare(ours, theirs).to_json()["settings"] == [
         {"what": "versions.numpy", "here": ours.versions["numpy"], "there": "0"}
     ]
     # trials of another protocol only have the same names
-    hashes = theirs.protocols["tiny_gravity"].model_copy(update={"collection": "another"})
-    protocols = {**theirs.protocols, "tiny_gravity": hashes}
-    theirs = theirs.model_copy(update={"protocols": protocols})
-    found = {row.name: row for row in compare(ours, theirs).figures}
-    assert found["gravity: incipient latency, mean"].basis == "trials"
+    hashes = changed(theirs.protocols["tiny_gravity"], collection="another")
+    theirs = changed(theirs, protocols={**theirs.protocols, "tiny_gravity": hashes})
+    assert {row.name: row for row in compare(ours, theirs).figures}[mean].basis == "trials"
 
 
 def test_compared_medians_count_late_detections(store: Store) -> None:
-    summary = read_summary(store)
-    (first, *_) = [row for row in summary.trials if row.experiment == "gravity"]
+    lost = {"outcome": "late", "gross": "missed"} | dict.fromkeys(
+        ("latency_gross_ms", "latency_incipient_ms", "lead_ms")
+    )
+    kept = {"outcome": "detected_first", "gross": "detected", "latency_gross_ms": 50.0}
 
-    def with_lost(lost: int) -> Summary:
-        rows = []
-        for k in range(40):
-            late = k < lost
-            rows.append(
-                first.model_copy(
-                    update={
-                        "trial": str(k),
-                        "outcome": "late" if late else "detected_first",
-                        "gross": "missed" if late else "detected",
-                        "latency_gross_ms": None if late else 50.0,
-                        "latency_incipient_ms": None if late else 100.0 + k,
-                        "lead_ms": None if late else 900.0 - k,
-                    }
-                )
-            )
-        return summary.model_copy(update={"trials": tuple(rows)})
+    def with_lost(number: int) -> Summary:
+        times = ({"latency_incipient_ms": 100.0 + k, "lead_ms": 900.0 - k} for k in range(40))
+        values = (lost if k < number else {**kept, **each} for k, each in enumerate(times))
+        return gravity_trials(read_summary(store), values)
 
     found = {row.name: row for row in compare(with_lost(10), with_lost(0)).figures}
     # of 100 to 139 ms the ten quickest came too late
-    assert found["gravity: incipient latency, median"].here == pytest.approx(129.5)
-    assert found["gravity: incipient latency, median"].there == pytest.approx(119.5)
+    median = found["gravity: incipient latency, median"]
+    assert (median.here, median.there) == pytest.approx((129.5, 119.5))
     assert found["gravity: lead, median"].difference == pytest.approx(-10.0)
     # means are of those that count
     assert found["gravity: incipient latency, mean"].here == pytest.approx(124.5)
@@ -584,18 +492,13 @@ def several_times(summary: Summary, *medians_ms: float) -> Summary:
     gravity = summary.gravity
     each = []
     for seed, median in enumerate(medians_ms):
-        times = gravity.latency_ms.incipient.model_copy(update={"median": median})
-        latency = gravity.latency_ms.model_copy(update={"incipient": times, "gross": times})
-        lead = gravity.lead_ms.model_copy(update={"median": median})
+        times = changed(gravity.latency_ms.incipient, median=median)
+        latency = changed(gravity.latency_ms, incipient=times, gross=times)
+        lead = changed(gravity.lead_ms, median=median)
         each.append(SeedTimes(seed=seed, chosen=not seed, latency_ms=latency, lead_ms=lead))
-    own = gravity.model_copy(
-        update={
-            "latency_ms": each[0].latency_ms,
-            "lead_ms": each[0].lead_ms,
-            "by_seed": tuple(each) if len(each) > 1 else (),
-        }
-    )
-    return summary.model_copy(update={"gravity": own})
+    first, several = each[0], tuple(each) if len(each) > 1 else ()
+    own = changed(gravity, latency_ms=first.latency_ms, lead_ms=first.lead_ms, by_seed=several)
+    return changed(summary, gravity=own)
 
 
 def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store) -> None:
@@ -608,7 +511,7 @@ def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store
     of_seeds = "gravity: incipient latency, median, mean of seeds"
     far = figures((300.0, 302.0, 301.0), (250.0, 252.0))[of_seeds]
     assert (far.unit, far.basis, far.here, far.there) == ("ms", "seeds", 301.0, 251.0)
-    assert far.beyond is True
+    assert far.beyond
     # two networks of one study
     near = figures((494.0, 249.0), (240.0,))
     assert near[of_seeds].difference == pytest.approx(371.5 - 240.0)

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.report.sources import report_folder
-from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import against
-from sliplab.flows.study import Outcome
 from sliplab.storage.trials.store import Store
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser
+from tests.flows.conftest import Ran
 
 pytestmark = needs_browser
 PAPER_PX = 703
@@ -35,7 +34,7 @@ EMPTY = """() => [...document.querySelectorAll('figure')].filter((e) => {
 
 
 @pytest.fixture(scope="module")
-def folder(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the small study's report, compared with itself."""
     store = tmp_path_factory.mktemp("page") / "store"
     shutil.copytree(ran[0][0].store, store, ignore=shutil.ignore_patterns("trials"))

@@ -25,25 +25,25 @@ from sliplab.flows import window_checks as check_flows
 from sliplab.flows.collect import collect
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import check_folder, check_labels, check_required
-from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import report
 from sliplab.flows.running import parallel_map
 from sliplab.flows.running.extras import lacking
-from sliplab.flows.study import Outcome, study
+from sliplab.flows.study import study
 from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
-from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
+from tests.flows.conftest import Ran, summary_json, tiny, tiny_gravity, write
 
 
-def store_of(ran: tuple[list[RunRequest], Outcome]) -> Store:
+def store_of(ran: Ran) -> Store:
     """The study's store."""
     return Store.open(ran[0][0].store)
 
 
-def test_every_step_did_its_work(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_every_step_did_its_work(ran: Ran) -> None:
     _, outcome = ran
     assert [item["committed"] for item in outcome.collected] == [6, 2]
     assert [(step["step"], step["done"]) for step in outcome.steps] == [
@@ -55,7 +55,7 @@ def test_every_step_did_its_work(ran: tuple[list[RunRequest], Outcome]) -> None:
     ]
 
 
-def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_labels_are_within_a_frame_of_the_truth(ran: Ran) -> None:
     errors = summary_json(store_of(ran))["labels"]["error_ms"]
     for kind in ("incipient", "gross"):
         assert errors[kind]["n"] >= 7
@@ -63,15 +63,12 @@ def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Out
 
 
 @pytest.mark.long
-def test_labels_of_tracks_are_checked_with_video(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path
-) -> None:
+def test_labels_of_tracks_are_checked_with_video(ran: Ran, tmp_path: Path) -> None:
     run_request = replace(ran[0][0], store=tmp_path / "store")
     shutil.copytree(store_of(ran).folder, run_request.store)
     assert check_required(run_request)
     assert check_labels(run_request, 2)["done"] == 2
     found = read_check(Store.open(run_request.store))
-    assert found is not None
     assert (found.trials, found.simulated) == (2, True)
     incipient = found.model_dump(mode="json")["rules_ms"]["paper"]["incipient"]
     assert incipient["n"] == 2
@@ -84,15 +81,13 @@ def test_labels_of_tracks_are_checked_with_video(
     assert check_labels(run_request, 3)["done"] == 1
 
 
-def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_the_summary_has_its_keys_and_says_simulated(ran: Ran) -> None:
     summary = summary_json(store_of(ran))
     assert summary["simulated"] is True
     kinematic = summary["kinematic"]
     assert set(kinematic["accuracy"]) == {"argmax", "strict", "margin", "n"}
     assert np.shape(kinematic["confusion"]) == (3, 4)
-    assert (
-        set(kinematic["precision"]) == set(kinematic["recall"]) == {"no_slip", "incipient", "gross"}
-    )
+    assert set(kinematic["precision"]) == set(kinematic["recall"]) == set(CLASSES)
     for kind in ("incipient", "gross"):
         latency = kinematic["latency_ms"][kind]
         counted = (latency[name] for name in ("n", "missed", "late", "false_early"))
@@ -110,19 +105,14 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest]
         assert held["apart_ms"]["incipient"]["n"] == trials
         assert held["apart_ms"]["incipient"]["max_abs"] <= 10.0  # a frame, by noise
     assert summary["sync"]["grade"] == "hardware trigger"
-    assert summary["quality"] == {
-        "planned": 8,
-        "committed": 8,
-        "retaken": 0,
-        "quarantined": 0,
-        "interrupted": 0,
-    }
+    none = dict.fromkeys(("retaken", "quarantined", "interrupted"), 0)
+    assert summary["quality"] == {"planned": 8, "committed": 8, **none}
     assert {"collect tiny", "label", "train", "evaluate", "report"} <= set(summary["timing_s"])
     assert set(summary["protocols"]) == {"tiny", "tiny_gravity"}
     assert summary["seeds"]["network"] == [0]
 
 
-def test_plan_and_collection_agree(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_plan_and_collection_agree(ran: Ran) -> None:
     for known in summary_json(store_of(ran))["planned"].values():
         assert known["seconds_collected"] == pytest.approx(known["seconds"], rel=0.1)
         # without a video these are events, and the plan reckons with the mean of all conditions;
@@ -130,7 +120,7 @@ def test_plan_and_collection_agree(ran: tuple[list[RunRequest], Outcome]) -> Non
         assert 0.5 < known["bytes_collected"] / known["bytes"] < 2.0
 
 
-def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_the_report_is_one_page_that_says_simulated(ran: Ran) -> None:
     text = (store_of(ran).folder / "report" / "index.html").read_text()
     assert "Every number and figure in this report is simulated" in text
     assert text.count("simulated tracks of the markers (no video was drawn)") >= 3
@@ -146,7 +136,9 @@ def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[RunRequest],
         assert all("xmlns" in line or "DTD" in line or "purl.org" in line for line in found)
 
 
-def test_nothing_changed_is_nothing_to_do(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_nothing_changed_is_nothing_to_do(ran: Ran) -> None:
+    result = collect(ran[0][0])
+    assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)
     again = study(ran[0])
     assert [item["taken"] for item in again.collected] == [0, 0]
     assert [step["done"] for step in again.steps] == [0, 0, 0, 0, 0]
@@ -154,7 +146,7 @@ def test_nothing_changed_is_nothing_to_do(ran: tuple[list[RunRequest], Outcome])
 
 @pytest.mark.long
 def test_another_margin_is_evaluation_and_report_only(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
+    ran: Ran, tmp_path: Path, rig_path: Path
 ) -> None:
     store = store_of(ran)
     counts = Derived.of(store, "counts", "tiny").folder
@@ -167,19 +159,14 @@ def test_another_margin_is_evaluation_and_report_only(
     ]
     outcome = study(run_requests)
     done = [(step["step"], step["done"]) for step in outcome.steps]
-    assert done == [
-        ("sync", 0),
-        ("label", 0),
-        ("train", 0),
-        ("evaluate", 1),
-        ("report", 1),
-    ]
+    undone = [(name, 0) for name in ("sync", "label", "train")]
+    assert done == [*undone, ("evaluate", 1), ("report", 1)]
     assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
     assert summary_json(store)["detection"]["tiny"]["margin"] == 3.0
     study(ran[0])  # back to what the other tests know
 
 
-def test_windows_are_looked_at_from_every_side(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_windows_are_looked_at_from_every_side(ran: Ran) -> None:
     summary = summary_json(store_of(ran))
     kinematic = summary["kinematic"]
     n = kinematic["accuracy"]["n"]
@@ -211,9 +198,7 @@ def test_windows_are_looked_at_from_every_side(ran: tuple[list[RunRequest], Outc
     assert kinematic["trained_baselines"] == {}
 
 
-def test_no_window_of_a_test_trial_is_near_a_training_window(
-    ran: tuple[list[RunRequest], Outcome],
-) -> None:
+def test_no_window_of_a_test_trial_is_near_a_training_window(ran: Ran) -> None:
     """Neighbours on a time line are alike: parts must have no trial, so no time line, in common."""
     store = store_of(ran)
     used = training_campaigns(collected(store))
@@ -234,7 +219,7 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(
 
 @pytest.mark.long
 def test_other_methods_are_kept_and_the_report_tells_of_them(
-    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
+    ran: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
     campaigns = collected(store)
@@ -256,7 +241,7 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
 
 
 def test_a_device_that_is_not_there_is_a_wrong_input(
-    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
+    ran: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
     monkeypatch.setattr("sliplab.analysis.networks.models.Model.fresh", False)
@@ -268,9 +253,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
         train(store, collected(store))
 
 
-def test_a_check_that_fails_ends_the_command(
-    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_that_fails_ends_the_command(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_of(ran)
     campaigns = collected(store)
     fair = Chance((0.3, 0.36), 0.2, 0.45, 0.8, 0.999)
@@ -282,7 +265,7 @@ def test_a_check_that_fails_ends_the_command(
         check_flows.window_checks(store, campaigns)
 
 
-def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_detectors_are_compared_at_equal_rates(ran: Ran) -> None:
     store = store_of(ran)
     summary = summary_json(store)
     compared = summary["detectors"]
@@ -302,7 +285,7 @@ def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outc
 
 @pytest.mark.long
 def test_smoothing_can_be_chosen_and_windows_can_overlap(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
+    ran: Ran, tmp_path: Path, rig_path: Path
 ) -> None:
     store = store_of(ran)
     kept = {path: path.stat().st_mtime_ns for path in (store.folder / "derived").glob("heard*/*/*")}
@@ -316,11 +299,8 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
         make_request(write(tmp_path / "p.yaml", data), rig_path, store.folder),
         make_request(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
     ]
-    assert [(s["step"], s["done"]) for s in study(run_requests).steps][2:] == [
-        ("train", 0),
-        ("evaluate", 1),
-        ("report", 1),
-    ]
+    done = [(s["step"], s["done"]) for s in study(run_requests).steps]
+    assert done[2:] == [("train", 0), ("evaluate", 1), ("report", 1)]
     # kept predictions are not made again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
     summary = summary_json(store)
@@ -345,7 +325,7 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
 
 
 @pytest.mark.long
-def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_a_margin_by_option_is_not_kept(ran: Ran) -> None:
     store = store_of(ran)
     campaigns = collected(store)
     assert evaluate(store, campaigns, margin=4.0)["done"] == 1
@@ -356,10 +336,7 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -
 
 
 def test_the_same_seed_gives_the_same_summary(
-    ran: tuple[list[RunRequest], Outcome],
-    tmp_path: Path,
-    rig_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    ran: Ran, tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parallel_map, "START_S", 0.0)  # all in processes, and still the same
     run_requests = [
@@ -375,19 +352,12 @@ def test_the_same_seed_gives_the_same_summary(
     assert json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
 
 
-def test_a_collection_that_is_complete_returns_at_once(
-    ran: tuple[list[RunRequest], Outcome],
-) -> None:
-    result = collect(ran[0][0])
-    assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)
-
-
 class _Killed(Exception):
     pass
 
 
 def test_a_training_that_was_killed_goes_on_to_the_same_model(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: Ran, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = (store_of(ran).folder / "models" / "seed0.pt").read_bytes()
     shutil.copytree(store_of(ran).folder, tmp_path / "store")
@@ -426,7 +396,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
 
 
 def test_the_model_goes_out_as_what_it_is(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: Ran, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
     from sliplab.flows.detecting.request import load_model

@@ -14,7 +14,6 @@ from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.clocks import synchronise
 from sliplab.analysis.clocks.refit import fit_again, same_clocks
 from sliplab.analysis.report.summary import sync_part
-from sliplab.flows.__main__ import main
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
@@ -25,6 +24,7 @@ from sliplab.storage.trials.checksums import CHECKSUMS, RECORD
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
+from tests.command_line import answer, here
 from tests.flows.conftest import tiny, write
 
 SHIFT_NS = 3_000_000
@@ -36,10 +36,8 @@ def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     folder = tmp_path_factory.mktemp("sync")
     data = tiny()
     data["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
-    data["analysis"]["split"] |= {
-        "validation_levels": {"direction": ["120 deg"]},
-        "test_levels": {"direction": ["240 deg"]},
-    }
+    for split, level in (("validation", "120 deg"), ("test", "240 deg")):
+        data["analysis"]["split"][f"{split}_levels"] = {"direction": [level]}
     run_request = make_request(write(folder / "tiny.yaml", data), rig_path, folder / "store")
     collect(run_request)
     return Store.open(folder / "store")
@@ -48,14 +46,6 @@ def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
 def recordings(store: Store) -> list[Recording]:
     """The store's trials, freshly opened."""
     return list(store.campaign("tiny").recordings())
-
-
-def sliplab(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """The command line, in this process."""
-    monkeypatch.setattr("sys.argv", ["sliplab", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(str(ended.value.code))
 
 
 def results(store: Store) -> list[dict[str, Any]]:
@@ -87,11 +77,9 @@ def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
     assert [recording.checksum for recording in recordings(store)] == before
     known = result["campaigns"]["tiny"]
     assert (known["trials"], known["refitted"], known["refused"]) == (3, 3, 0)
-    assert {name: device["grade"] for name, device in known["devices"].items()} == {
-        "events": "trigger input",
-        "frames": "hardware trigger",
-        "arm": "digital input",
-    }
+    grades = {name: device["grade"] for name, device in known["devices"].items()}
+    known = {"events": "trigger input", "frames": "hardware trigger", "arm": "digital input"}
+    assert grades == known
     json.dumps(result, allow_nan=False)
 
 
@@ -202,13 +190,9 @@ def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
 
 def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
     text = Path(sync(store, collected(store))["page"]).read_text()
-    for name in (
-        "Residuals over a trial",
-        "Drift over the campaign",
-        "Pulses and frames",
-        "Uncertainty of events against frames and arm",
-        "The worst trials",
-    ):
+    titles = ("Residuals over a trial", "Drift over the campaign", "Pulses and frames")
+    uncertainty = "Uncertainty of events against frames and arm"
+    for name in (*titles, uncertainty, "The worst trials"):
         assert f"<h2>{name}" in text
     assert text.count("<figure>") == text.count(">simulated</text>") == 4
     for unit in ("residual (µs)", "drift (ppm)", "uncertainty (µs)", "missed pulses", "lost"):
@@ -222,11 +206,8 @@ def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
 
 def test_processors_may_differ_in_the_last_digit() -> None:
     clock = {"grade": "a", "drift_ppm": 12.5, "map": {"device_ns": [5], "drift": [10**13]}}
-    near = {
-        "grade": "a",
-        "drift_ppm": 12.5 + 1e-13,
-        "map": {"device_ns": [5], "drift": [10**13 + 9]},
-    }
+    close = {"device_ns": [5], "drift": [10**13 + 9]}
+    near = {"grade": "a", "drift_ppm": 12.5 + 1e-13, "map": close}
     assert same_clocks(clock, near)
     for change in (
         {"grade": "b"},
@@ -237,36 +218,21 @@ def test_processors_may_differ_in_the_last_digit() -> None:
     assert not same_clocks(clock, {"grade": "a"})
 
 
-def test_the_command_prints_a_table_and_one_object(
-    store: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert sliplab(monkeypatch, "sync", store.folder) == 0
-    shown = capsys.readouterr().out
+def test_the_command_prints_a_table_and_one_object(store: Store, tmp_path: Path) -> None:
+    done = here("sync", store.folder)
+    assert done.returncode == 0
     for word in ("Clocks of tiny (simulated)", "hardware", "events", "sync.html"):
-        assert word in shown
-    assert sliplab(monkeypatch, "sync", store.folder, "--campaign", "tiny", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+        assert word in done.stdout
+    found = answer("sync", store.folder, "--campaign", "tiny")
     assert (found["step"], found["simulated"], found["fresh"]) == ("sync", True, 3)
-    assert found["campaigns"]["tiny"]["devices"]["arm"]["pulses"].keys() == {
-        "missed",
-        "late",
-        "spurious",
-    }
-
-
-def test_a_store_without_a_campaign_says_what_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pulses = found["campaigns"]["tiny"]["devices"]["arm"]["pulses"]
+    assert pulses.keys() == {"missed", "late", "spurious"}
+    other = here("sync", store.folder, "--campaign", "other")
+    assert (other.returncode, "there are tiny" in other.stderr) == (2, True)
     Store.create(tmp_path / "store")
-    assert sliplab(monkeypatch, "sync", tmp_path / "store") == 1
-    assert "holds no campaign yet; run `sliplab collect` first" in capsys.readouterr().err
-
-
-def test_a_campaign_that_is_not_there_is_named(
-    store: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert sliplab(monkeypatch, "sync", store.folder, "--campaign", "other") == 2
-    assert "there are tiny" in capsys.readouterr().err
+    empty = here("sync", tmp_path / "store")
+    assert empty.returncode == 1
+    assert "holds no campaign yet; run `sliplab collect` first" in empty.stderr
 
 
 def test_a_campaign_without_trials_has_a_page_that_says_so(

@@ -31,13 +31,8 @@ BAD = [
     {"kind": "pulses_duplicated", "at_s": 1.8, "count": 8, "device": "arm"},
     {"kind": "pulses_duplicated", "at_s": 2.6, "count": 8, "device": "event_camera"},
 ]
-DRIFTING = {
-    "arm_ppm": 190.0,
-    "event_camera_ppm": 190.0,
-    "frame_camera_ppm": 190.0,
-    "sync_box_ppm": 190.0,
-    "pulse_jitter_us": 5.0,
-}
+CLOCKS = ("arm", "event_camera", "frame_camera", "sync_box")
+DRIFTING = {f"{name}_ppm": 190.0 for name in CLOCKS} | {"pulse_jitter_us": 5.0}
 EXACT = {"arm_controller": {"resolution_us": 0}, "frame_camera": {"resolution_us": 0}}
 """As it is in the simulation: only the event camera and the box cut their stamps."""
 TIMINGS: dict[str, dict[str, Any]] = {
@@ -104,14 +99,8 @@ def test_every_accepted_trial_agrees_with_the_truth(
     faults = [
         fault for fault in BAD if fault["device"] != "arm" or timing.get("arm") != "host time"
     ]
-    work, campaign = session(
-        tmp_path,
-        slides(),
-        {**EXACT, **timing},
-        clocks=DRIFTING,
-        faults=faults,
-        frame_camera={"level": "tracks"},
-    )
+    timing = {**EXACT, **timing}
+    work, campaign = session(tmp_path, slides(), timing, clocks=DRIFTING, faults=faults)
     take_all(work)
     recordings = list(campaign.recordings())
     assert len(recordings) == 3
@@ -143,9 +132,7 @@ def test_every_accepted_trial_agrees_with_the_truth(
 
 def test_every_grade_is_named_with_its_gate(tmp_path: Path) -> None:
     for number, timing in enumerate(TIMINGS.values()):
-        work, campaign = session(
-            tmp_path / str(number), slides(), timing, frame_camera={"level": "tracks"}
-        )
+        work, campaign = session(tmp_path / str(number), slides(), timing)
         work.take(list(work.plan)[:1])
         limits = work.plan.protocol.collection.gates.sync_uncertainty
         (recording,) = campaign.recordings()
@@ -164,7 +151,7 @@ def test_a_clock_that_begins_anew_is_fitted_in_pieces_and_the_trial_taken_again(
     tmp_path: Path,
 ) -> None:
     fault = {"kind": "clock_restart", "trial": 1, "at_s": 2.0, "device": "event_camera"}
-    work, campaign = session(tmp_path, slides(), faults=[fault], frame_camera={"level": "tracks"})
+    work, campaign = session(tmp_path, slides(), faults=[fault])
     take_all(work)
     assert len(campaign.committed()) == 3
     (failed,) = campaign.quarantined()

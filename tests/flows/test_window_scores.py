@@ -42,18 +42,9 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     campaigns = collected(store)
     label(store, campaigns)
     rejected, recording = list(campaigns[0].of_split("test"))[-1]
-    decide(
-        store,
-        "first",
-        rejected.id,
-        "reject",
-        label=Labels(store).key(campaigns[0], recording),
-        old=Onsets(),
-        new=Onsets(),
-        seen=0,
-        who="a person",
-        why="the skin was dirty",
-    )
+    key = Labels(store).key(campaigns[0], recording)
+    known = {"label": key, "old": Onsets(), "new": Onsets(), "seen": 0, "who": "a person"}
+    decide(store, "first", rejected.id, "reject", **known, why="the skin was dirty")
     train(store, campaigns, reviewed=True)
     return store
 
@@ -88,7 +79,6 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
     found = evaluation_of(two)
     assert {rule.margin for rule in found.detection.values()} == {margin}
     kept = kept_counts(two, found.key)
-    assert kept is not None
     expected = metrics.accuracy(kept["counts"], kept["y"], margin).margin
     assert found.windows.accuracy.margin == expected
     (seed,) = found.windows.seeds.each

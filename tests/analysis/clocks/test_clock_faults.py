@@ -98,7 +98,6 @@ def test_pulses_lost_doubled_and_late_here_and_there_are_no_jump() -> None:
     stamps = np.delete(stamps, np.arange(100, 140))
     stamps = np.sort(np.append(stamps, stamps[300:320] + 200_000))
     fit = fitted(stamps, reference)
-    assert fit is not None
     assert np.abs(fit.map.to_reference(true) - reference).max() <= 3 * fit.uncertainty_ns
     assert (fit.pulses_late, fit.pulses_missed) == (15, 40)
 

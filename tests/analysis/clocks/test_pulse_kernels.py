@@ -8,21 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sliplab.analysis.clocks.pulse_kernels import (
-    best_shift,
-    changes,
-    fullest,
-    largest_sizes,
-    median,
-    most_off,
-    normal_equations,
-    pair,
-    partners,
-    places_of,
-    quantile,
-    residuals_at,
-    robust_values,
-)
+from sliplab.analysis.clocks import pulse_kernels
+from sliplab.analysis.clocks.pulse_kernels import best_shift, changes, places_of, robust_values
 
 Floats = NDArray[np.float64]
 TIMES = st.lists(st.integers(0, 40), min_size=1, max_size=30).map(
@@ -43,7 +30,7 @@ def test_pairs_are_each_others_nearest(predicted: Floats, y: Floats, gate: int) 
     there = nearest(y, predicted)
     mutual = nearest(predicted, y)[there] == np.arange(predicted.size)
     expected = np.flatnonzero(mutual & (np.abs(y[there] - predicted) <= gate))
-    i, j = pair(predicted, y, float(gate))
+    i, j = pulse_kernels.pair(predicted, y, float(gate))
     assert i.tolist() == expected.tolist()
     assert j.tolist() == there[expected].tolist()
 
@@ -52,7 +39,7 @@ def test_pairs_are_each_others_nearest(predicted: Floats, y: Floats, gate: int) 
 def test_partners_lie_within_reach(predicted: Floats, y: Floats, reach: int) -> None:
     apart = y[None, :] - predicted[:, None]
     expected = np.nonzero((apart >= -reach) & (apart < reach))
-    which, partner = partners(predicted, y, float(reach))
+    which, partner = pulse_kernels.partners(predicted, y, float(reach))
     assert which.tolist() == expected[0].tolist()
     assert partner.tolist() == expected[1].tolist()
 
@@ -60,14 +47,14 @@ def test_partners_lie_within_reach(predicted: Floats, y: Floats, reach: int) -> 
 @given(ordered=TIMES, window=st.integers(0, 9))
 def test_the_fullest_window_is_the_first_of_the_best(ordered: Floats, window: int) -> None:
     held = np.searchsorted(ordered, ordered + window, side="right") - np.arange(ordered.size)
-    assert fullest(ordered, float(window)) == ordered[int(held.argmax())]
+    assert pulse_kernels.fullest(ordered, float(window)) == ordered[int(held.argmax())]
 
 
 @given(values=st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=50), share=st.floats(0, 1))
 def test_median_and_quantile_are_numpys(values: list[float], share: float) -> None:
     array = np.array(values)
-    assert median(array) == np.median(array)
-    assert quantile(array, share) == np.quantile(array, share)
+    assert pulse_kernels.median(array) == np.median(array)
+    assert pulse_kernels.quantile(array, share) == np.quantile(array, share)
 
 
 @pytest.mark.parametrize("n", [2, 3, 9])
@@ -79,7 +66,7 @@ def test_normal_equations_are_weighted_sums(n: int) -> None:
     at = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, n - 2)
     assert piece.tolist() == at.tolist()
     assert share.tolist() == ((x - knots[at]) / (knots[at + 1] - knots[at])).tolist()
-    matrix, right = normal_equations(piece, share, y, y, 5.0, 2.0, n)
+    matrix, right = pulse_kernels.normal_equations(piece, share, y, y, 5.0, 2.0, n)
     weights = np.where(np.abs(y) <= 5.0, np.minimum(1.0, 2.0 / np.maximum(np.abs(y), 1e-9)), 0.0)
     assert matrix[0, 0] == np.bincount(piece, weights * (1 - share) ** 2, n - 1)[0]
     assert matrix[-1, -1] == np.bincount(piece, weights * share**2, n - 1)[-1]
@@ -89,7 +76,7 @@ def test_normal_equations_are_weighted_sums(n: int) -> None:
     assert right[-1] == np.bincount(piece, weights * share * y, n - 1)[-1]
     values = rng.normal(0, 1, n)
     line = values[piece] + share * (values[piece + 1] - values[piece])
-    assert residuals_at(piece, share, y, values).tolist() == (y - line).tolist()
+    assert pulse_kernels.residuals_at(piece, share, y, values).tolist() == (y - line).tolist()
 
 
 def hats(x: Floats, knots: Floats) -> Floats:
@@ -172,7 +159,9 @@ def test_the_robust_values_solve_hubers_equations(n: int) -> None:
 def test_the_largest_sizes_are_those_of_the_product() -> None:
     rng = np.random.default_rng(5)
     draws, root = rng.normal(size=(50, 6)), np.tril(rng.normal(size=(6, 6)))
-    assert largest_sizes(draws, root) == pytest.approx(np.abs(draws @ root.T).max(axis=1))
+    assert pulse_kernels.largest_sizes(draws, root) == pytest.approx(
+        np.abs(draws @ root.T).max(axis=1)
+    )
 
 
 @pytest.mark.parametrize("at_ends", [False, True])
@@ -188,7 +177,7 @@ def test_most_off_looks_at_every_window(at_ends: bool) -> None:
             there = high[first + width - 1] - low[first]
             if there <= 1.5 * width:
                 off.append(min(width, there) - (fits[first + width] - fits[first]))
-        assert most_off(width, fits, low, high, at_ends) == max(off)
+        assert pulse_kernels.most_off(width, fits, low, high, at_ends) == max(off)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.floats(0.1, 0.9))

@@ -5,13 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detector_comparison import (
-    Judged,
-    allowed_early,
-    merit,
-    outcomes,
-    set_levels,
-)
+from sliplab.analysis.detectors import detector_comparison
+from sliplab.analysis.detectors.detector_comparison import Judged, allowed_early, merit, set_levels
 from sliplab.analysis.detectors.detectors import Evidence, Levels
 from sliplab.analysis.detectors.latency import TrialLatency, TrueSlip
 from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing, settled
@@ -43,7 +38,7 @@ def test_levels_let_through_what_is_allowed_and_are_the_lowest(
     levels = set_levels(trials, allowed, EARLY)
 
     def early(incipient: float, gross: float) -> tuple[int, int]:
-        scored = outcomes(trials, Levels(incipient, gross), EARLY)
+        scored = detector_comparison.outcomes(trials, Levels(incipient, gross), EARLY)
         return (
             sum(t.false_early_incipient for t in scored),
             sum(t.false_early_gross for t in scored),
@@ -82,16 +77,14 @@ def test_a_share_is_a_whole_number_of_trials(rate: float, trials: int, allowed: 
 
 
 def scored(latency: float | None, early: bool = False) -> TrialLatency:
+    none = dict.fromkeys(("latency_gross_ms", "lead_ms", "late_incipient_ms", "late_gross_ms"))
     return TrialLatency(
         latency_incipient_ms=latency,
-        latency_gross_ms=None,
-        lead_ms=None,
-        late_incipient_ms=None,
-        late_gross_ms=None,
         missed_incipient=latency is None and not early,
         missed_gross=True,
         false_early_incipient=early,
         false_early_gross=False,
+        **none,
     )
 
 

@@ -86,14 +86,8 @@ def test_what_adds_up_evidence_beats_the_average_here(compared: DetectorComparis
 
 
 def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparison) -> None:
-    other = compare(
-        Parts(parts().train, parts().validation, [trial(900, 10)]),
-        WINDOWS,
-        SETTINGS,
-        10,
-        WINDOWS.steps,
-    )
-    assert other is not None
+    one = Parts(parts().train, parts().validation, [trial(900, 10)])
+    other = compare(one, WINDOWS, SETTINGS, 10, WINDOWS.steps)
     for mine, theirs in zip(compared.detectors, other.detectors, strict=True):
         for a, b in zip(mine.rates, theirs.rates, strict=True):
             assert (a.levels, a.choice, a.validation) == (b.levels, b.choice, b.validation)
@@ -108,14 +102,8 @@ def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> 
         return {"paper": OnsetReference(slip), "true": OnsetReference(earlier)}
 
     of = parts()
-    found = compare(
-        Parts(seen(of.train), seen(of.validation), seen(of.test)),
-        WINDOWS,
-        SETTINGS,
-        10,
-        WINDOWS.steps,
-    )
-    assert found is not None
+    judged = Parts(seen(of.train), seen(of.validation), seen(of.test))
+    found = compare(judged, WINDOWS, SETTINGS, 10, WINDOWS.steps)
     for mine, theirs in zip(found.detectors, compared.detectors, strict=True):
         assert mine.curve == theirs.curve
         for a, b in zip(mine.rates, theirs.rates, strict=True):
@@ -134,7 +122,6 @@ def test_one_stride_is_compared_once() -> None:
         *([thinned(t, 3) for t in p] for p in (parts(3, 3).validation, parts(3, 3).test)),
     )
     found = compare(few, WINDOWS, SETTINGS, 30, WINDOWS.steps)
-    assert found is not None
     assert found.strides_ms == (30,)
     assert len(found.detectors) == 8
 

@@ -7,16 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detectors import (
-    Detector,
-    Labelled,
-    Levels,
-    Predictions,
-    Smoothing,
-    decide,
-    first_above,
-    learn,
-)
+from sliplab.analysis.detectors import detectors
+from sliplab.analysis.detectors.detectors import Labelled, Levels, Predictions, Smoothing, decide
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
@@ -41,9 +33,9 @@ def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> 
     return Labelled(predictions(counts), TrueSlip(first, second, second + sliding * LENGTH))
 
 
-LEARNED = learn([trial(seed) for seed in range(8)], LENGTH, 30)
+LEARNED = detectors.learn([trial(seed) for seed in range(8)], LENGTH, 30)
 FINE = LEARNED.detectors(1 / 3)
-DETECTORS: dict[str, Detector] = {
+DETECTORS: dict[str, detectors.Detector] = {
     "smoothing": Smoothing(4),
     **LEARNED.detectors(1.0),
     "fine": FINE["hmm counts"],
@@ -102,7 +94,6 @@ def test_no_windows_silent_windows_and_a_trial_without_slip(name: str) -> None:
     found = decide(detector.evidence(calm.predictions), Levels(level, 3.0))
     assert (found.incipient_ns, found.gross_ns) == (None, None)
     found = decide(detector.evidence(slips.predictions), Levels(level, 3.0))
-    assert found.incipient_ns is not None
     assert found.gross_ns is not None
     assert slips.slip.incipient_ns < found.incipient_ns < slips.slip.gross_ns < found.gross_ns
 
@@ -140,13 +131,13 @@ def test_gross_needs_incipient_first() -> None:
 
 
 def test_a_level_must_be_exceeded() -> None:
-    assert first_above(np.array([1.0, 2.0, 3.0]), 2.0) == 2
-    assert first_above(np.array([3.0, 2.0, 3.0]), 2.0, 1) == 2
-    assert first_above(np.empty(0), 0.0) is None
+    assert detectors.first_above(np.array([1.0, 2.0, 3.0]), 2.0) == 2
+    assert detectors.first_above(np.array([3.0, 2.0, 3.0]), 2.0, 1) == 2
+    assert detectors.first_above(np.empty(0), 0.0) is None
 
 
 def test_no_trials_teach_nothing_and_break_nothing() -> None:
-    for detector in learn([], LENGTH, 30).detectors(1.0).values():
+    for detector in detectors.learn([], LENGTH, 30).detectors(1.0).values():
         evidence = detector.evidence(predictions(np.full((5, 3), 4)))
         assert np.isfinite(evidence.incipient).all()
 

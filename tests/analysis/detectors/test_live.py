@@ -10,28 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detectors import (
-    Chain,
-    Cusum,
-    Detector,
-    Filter,
-    Levels,
-    Predictions,
-    Reading,
-    Smoothing,
-    Tuned,
-    decide,
-    fit_logistic,
-)
-from sliplab.analysis.detectors.live import (
-    SPAN_NS,
-    ClockFellBack,
-    Decision,
-    FreshestArrival,
-    LiveDetector,
-    StepDetector,
-    StepRule,
-)
+from sliplab.analysis.detectors import detectors
+from sliplab.analysis.detectors import live as lives
+from sliplab.analysis.detectors.detectors import Chain, Cusum, Detector, Levels, Predictions, Tuned
+from sliplab.analysis.detectors.live import Decision, FreshestArrival, LiveDetector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.windows import bin_events
@@ -43,8 +25,10 @@ SIZE = {"width": 60, "height": 50}
 LENGTH_US = 4000
 ROW = np.array([[3, 9, 4]])
 _MEANS = np.repeat([(9, 3, 3), ROW[0], (2, 4, 9)], 50, axis=0)
-READING = Reading(
-    fit_logistic(np.random.default_rng(0).poisson(_MEANS), np.repeat([0, 1, 2], 50), 3), False, 1.0
+READING = detectors.Reading(
+    detectors.fit_logistic(np.random.default_rng(0).poisson(_MEANS), np.repeat([0, 1, 2], 50), 3),
+    False,
+    1.0,
 )
 """Of spike counts in the three states."""
 
@@ -141,7 +125,7 @@ def test_the_rule_step_by_step_is_the_rule(
     counts = np.array(rows, np.int64).reshape(-1, 3)
     ends = 30 * np.arange(1, len(counts) + 1, dtype=np.int64)
     whole = detect(counts, ends, rule)
-    running = StepRule(rule)
+    running = lives.StepRule(rule)
     said = [running.step(row) for row in counts]
     assert [step.valid_class for step in said] == whole.valid_class.tolist()
     assert [step.smoothed for step in said] == [tuple(row) for row in whole.smoothed.tolist()]
@@ -153,7 +137,13 @@ def test_the_rule_step_by_step_is_the_rule(
 @settings(max_examples=50)
 @given(
     st.lists(st.tuples(*[st.integers(0, 30)] * 3), max_size=30),
-    st.sampled_from([Smoothing(2), Cusum(READING), Filter(Chain(np.array([0.1, 0.2])), READING)]),
+    st.sampled_from(
+        [
+            detectors.Smoothing(2),
+            Cusum(READING),
+            detectors.Filter(Chain(np.array([0.1, 0.2])), READING),
+        ]
+    ),
     st.floats(0.0, 6.0),
 )
 def test_a_detector_step_by_step_decides_as_on_the_whole(
@@ -162,8 +152,8 @@ def test_a_detector_step_by_step_decides_as_on_the_whole(
     counts = np.array(rows, np.int64).reshape(-1, 3)
     seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))
     levels = Levels(level, level / 2)
-    expected = decide(detector.evidence(seen), levels)
-    running = StepDetector(Tuned("", detector, levels))
+    expected = detectors.decide(detector.evidence(seen), levels)
+    running = lives.StepDetector(Tuned("", detector, levels))
     steps = [running.step(row, int(row.sum())) for row in counts]
     found = [next((k for k, it in enumerate(steps) if it.onset == name), None) for name in CLASSES]
     assert found == [None, expected.incipient_ns, expected.gross_ns]
@@ -178,7 +168,7 @@ def test_a_detector_begins_anew_after_a_gap() -> None:
     assert ratio > 0
     level = 1.5 * ratio
     for gap, onset in ((False, "incipient"), (True, None)):
-        running = StepDetector(Tuned("", Cusum(READING), Levels(level, level)))
+        running = lives.StepDetector(Tuned("", Cusum(READING), Levels(level, level)))
         assert running.step(ROW[0], 0).onset is None
         if gap:
             running.interrupt()
@@ -207,11 +197,8 @@ def test_a_quiet_scene_is_judged_by_the_clock() -> None:
     assert live.push(events([])) == []
     assert live.advance(5000) == []
     made = live.advance(5000 + 3 * LENGTH_US)
-    assert [(item.start_us, item.events, item.by_event) for item in made] == [
-        (5000, 0, False),
-        (9000, 0, False),
-        (13000, 0, False),
-    ]
+    found = [(item.start_us, item.events, item.by_event) for item in made]
+    assert found == [(start_us, 0, False) for start_us in (5000, 9000, 13000)]
     assert not np.concatenate(network.seen).any()
     assert made[0].last_event_us is None
     assert live.advance(12000) == []  # time does not go back
@@ -265,17 +252,13 @@ def test_a_gap_begins_the_sliding_window_anew(inside: bool) -> None:
 def test_a_clock_that_falls_back_is_another_clock() -> None:
     live = detector(Network())
     live.push(events([10_000_000]))
-    with pytest.raises(ClockFellBack, match="fell back"):
+    with pytest.raises(lives.ClockFellBack, match="fell back"):
         live.push(events([8_000_000]))
 
 
 def test_counts_stop_at_255_whatever_the_pieces() -> None:
-    many = EventChunk(
-        np.full(400, 30, np.uint16),
-        np.full(400, 20, np.uint16),
-        np.ones(400, np.uint8),
-        np.arange(400, dtype=np.int64),
-    )
+    full = (np.full(400, 30, np.uint16), np.full(400, 20, np.uint16), np.ones(400, np.uint8))
+    many = EventChunk(*full, np.arange(400, dtype=np.int64))
     network = Network()
     live = detector(network)
     for begin in range(0, 400, 90):
@@ -291,22 +274,12 @@ def test_what_is_wrong_is_refused() -> None:
     with pytest.raises(ValueError, match="positive"):
         detector(Network(), stride_us=0)
     with pytest.raises(ValueError, match="outside 60 x 50"):
-        detector(Network()).push(
-            EventChunk(
-                np.array([60], np.uint16),
-                np.array([0], np.uint16),
-                np.array([1], np.uint8),
-                np.array([0]),
-            )
-        )
+        detector(Network()).push(EventChunk(*(np.array([value]) for value in (60, 0, 1, 0))))
     with pytest.raises(ValueError, match="expected integers"):
-        StepRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
+        lives.StepRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
 
 
-@given(
-    st.lists(st.integers(0, 5000), min_size=1, max_size=40),
-    st.integers(-(10**12), 10**12),
-)
+@given(st.lists(st.integers(0, 5000), min_size=1, max_size=40), st.integers(-(10**12), 10**12))
 def test_the_freshest_arrival_bounds_the_clock(delays_us: list[int], offset_us: int) -> None:
     clock = FreshestArrival()
     assert clock.camera_us(0) is None
@@ -322,6 +295,6 @@ def test_an_old_arrival_is_forgotten() -> None:
     clock = FreshestArrival()
     clock.observe(0, 0)
     for number in (1, 2):  # 1 ms later and later, as drift would have it
-        at_ns = number * SPAN_NS
+        at_ns = number * lives.SPAN_NS
         clock.observe(at_ns // 1000 - 1000 * number, at_ns)
-    assert clock.camera_us(2 * SPAN_NS) == 2 * SPAN_NS // 1000 - 1000
+    assert clock.camera_us(2 * lives.SPAN_NS) == 2 * lives.SPAN_NS // 1000 - 1000

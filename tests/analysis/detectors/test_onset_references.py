@@ -7,14 +7,9 @@ from typing import Any
 
 import pytest
 
+from sliplab.analysis.detectors import onset_references
 from sliplab.analysis.detectors.latency import TrueSlip, score_trial, summarise_latency, true_slip
-from sliplab.analysis.detectors.onset_references import (
-    Decided,
-    OnsetReference,
-    References,
-    judge_by_reference,
-    references_of,
-)
+from sliplab.analysis.detectors.onset_references import Decided, judge_by_reference, references_of
 from sliplab.analysis.detectors.smoothing_rule import Found
 from sliplab.storage.schema.evaluation import DetectorRate
 from sliplab.storage.schema.label import OnsetDoubts, TrialLabel
@@ -28,22 +23,24 @@ TOLERANCE = 30 * MS
 
 def reference(
     incipient_ms: int, gross_ms: int = 1500, ends_ms: tuple[int, int] | None = None
-) -> OnsetReference:
+) -> onset_references.OnsetReference:
     """Rest at 1800 ms; times in ms after START."""
     slip = TrueSlip(START + incipient_ms * MS, START + gross_ms * MS, START + 1800 * MS)
-    return OnsetReference(
+    return onset_references.OnsetReference(
         slip, None if ends_ms is None else (START + ends_ms[0] * MS, START + ends_ms[1] * MS)
     )
 
 
-def decided(incipient_ms: int | None, references: References, gross_ms: int = 1550) -> Decided:
+def decided(
+    incipient_ms: int | None, references: onset_references.References, gross_ms: int = 1550
+) -> Decided:
     found = None if incipient_ms is None else START + incipient_ms * MS
     return Decided(
         Found(found, None if found is None else START + gross_ms * MS), references, TOLERANCE
     )
 
 
-LATE_LABEL: References = {
+LATE_LABEL: onset_references.References = {
     "paper": reference(1000),
     "change_point": reference(902, 1400, (899, 905)),
     "true": reference(900, 1400),
@@ -58,11 +55,8 @@ def test_a_decision_between_the_onsets_is_false_early_by_one_and_a_latency_by_th
     assert (point.false_early, point.median) == (0, 48)
     assert (true.false_early, true.median) == (0, 50)
     assert [found[name].false_early_rate.value for name in found] == [1, 0, 0]  # type: ignore[union-attr]
-    assert [(found[n].early_by_paper, found[n].not_before) for n in found] == [
-        (1, 0),
-        (1, 1),
-        (1, 1),
-    ]
+    early = [(found[n].early_by_paper, found[n].not_before) for n in found]
+    assert early == [(1, 0), (1, 1), (1, 1)]
     # gross slip, too: 1550 ms is 50 after the paper's onset, 150 after the others
     assert [found[name].latency_ms.gross.median for name in found] == [50, 150, 150]
 
@@ -87,7 +81,9 @@ def test_missed_and_late_are_so_by_each_onset_of_its_own() -> None:
 
 
 def test_equal_onsets_give_equal_rows() -> None:
-    same: References = dict.fromkeys(("paper", "change_point", "true"), reference(1000))  # type: ignore[assignment]
+    same: onset_references.References = dict.fromkeys(
+        ("paper", "change_point", "true"), reference(1000)
+    )  # type: ignore[assignment]
     times = (500, 980, 1010, 1020, 1100, 1200, 1300, 1600, None)
     found = judge_by_reference([decided(at, same) for at in times])
     assert found["paper"] == found["change_point"] == found["true"]
@@ -98,7 +94,6 @@ def test_equal_onsets_give_equal_rows() -> None:
     assert figures.median == 150.0
     assert ours.median_incipient_ms is not None
     low, high = ours.median_incipient_ms
-    assert low is not None
     assert -20 <= low < 10
     assert high is None, "no upper bound"
 
@@ -112,7 +107,7 @@ def test_a_row_is_what_the_trials_judge_gives() -> None:
 
 
 def test_a_trial_without_a_change_point_is_counted_as_lacking() -> None:
-    without: References = {"paper": reference(1000), "true": reference(900, 1400)}
+    without: onset_references.References = {"paper": reference(1000), "true": reference(900, 1400)}
     found = judge_by_reference([decided(950, LATE_LABEL), decided(950, without)])
     assert [(each.trials, each.lacking) for each in found.values()] == [(2, 0), (1, 1), (2, 0)]
     alone = judge_by_reference([decided(950, without)])["change_point"]
@@ -128,7 +123,7 @@ def test_an_interval_that_decides_is_counted() -> None:
 
 
 def test_without_truth_there_is_no_true_row_and_without_any_onset_no_row() -> None:
-    real: References = {"paper": reference(1000), "change_point": reference(902)}
+    real: onset_references.References = {"paper": reference(1000), "change_point": reference(902)}
     assert list(judge_by_reference([decided(950, real)])) == ["paper", "change_point"]
     assert judge_by_reference([decided(950, {})]) == judge_by_reference([]) == {}
 
@@ -136,14 +131,9 @@ def test_without_truth_there_is_no_true_row_and_without_any_onset_no_row() -> No
 def label(rule: str = "paper", **changed: Any) -> TrialLabel:
     onsets = {"paper": (310, 450), "change_point": (260, 400)}
     none = {"incipient": None, "gross": None}
-    parts = {
-        name: {
-            "incipient_ns": a * MS,
-            "gross_ns": b * MS,
-            "doubts": none,
-            "first_marker": 1,
-            "per_marker_ns": [b * MS, a * MS],
-        }
+    parts: dict[str, Any] = {
+        name: {"incipient_ns": a * MS, "gross_ns": b * MS, "per_marker_ns": [b * MS, a * MS]}
+        | {"doubts": none, "first_marker": 1}
         for name, (a, b) in onsets.items()
     }
     parts["change_point"] |= {"low_ns": [399 * MS, 258 * MS], "high_ns": [401 * MS, 263 * MS]}
@@ -192,7 +182,6 @@ def test_doubted_and_absent_onsets_are_lacking(
 ) -> None:
     truth(monkeypatch, None)
     points = label().change_point
-    assert points is not None
     doubted = points.model_copy(update={"doubts": OnsetDoubts(gross="it creeps")})
     both = label().model_copy(update={"change_point": doubted})
     assert set(references_of(recording, both)) == {"paper"}
@@ -215,18 +204,8 @@ def test_the_labels_own_rule_is_as_every_other_figure_has_it(
 
 
 def test_an_evaluation_of_before_has_no_figures_by_reference(tmp_path: Path) -> None:
-    latency = {
-        "mean": None,
-        "std": None,
-        "median": None,
-        "p95": None,
-        "min": None,
-        "max": None,
-        "n": 0,
-        "missed": 0,
-        "late": 0,
-        "false_early": 0,
-    }
+    latency = dict.fromkeys(("mean", "std", "median", "p95", "min", "max"))
+    latency |= dict.fromkeys(("n", "missed", "late", "false_early"), 0)
     trials = {
         "false_early_before_ms": [],
         "false_early_rate": {"value": 0, "low": 0, "high": 1},
@@ -234,14 +213,8 @@ def test_an_evaluation_of_before_has_no_figures_by_reference(tmp_path: Path) -> 
         "latency_ms": {"incipient": latency, "gross": latency},
         "lead_ms": {**latency, "detected_first": 0},
     }
-    older = {
-        "asked": 0.02,
-        "allowed": 0,
-        "choice": 4,
-        "levels": {"incipient": 1.0, "gross": None},
-        "validation": trials,
-        "test": trials,
-    }
+    older = {"asked": 0.02, "allowed": 0, "choice": 4, "levels": {"incipient": 1.0, "gross": None}}
+    older |= {"validation": trials, "test": trials}
     read = DetectorRate.model_validate(older)
     assert read.by_reference == {}
     assert read.to_json() == older

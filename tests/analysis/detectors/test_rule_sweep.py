@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sliplab.analysis.detectors import rule_sweep
 from sliplab.analysis.detectors.latency import (
     NEVER,
     TrueSlip,
@@ -12,14 +13,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
     summarise_lead,
 )
-from sliplab.analysis.detectors.rule_sweep import (
-    Counted,
-    Trials,
-    choose_pair,
-    choose_smoothing,
-    score,
-    sweep,
-)
+from sliplab.analysis.detectors.rule_sweep import Counted, Trials, choose_pair, score, sweep
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
 
@@ -82,7 +76,7 @@ def test_the_choice_is_the_evaluations(found: list[Counted], rate: float) -> Non
     each, truth = swept(found)
     s, m = choose_pair(each, truth, SMOOTHINGS, MARGINS, rate)
     grid = Detection(smoothing_grid=SMOOTHINGS, margin_grid=MARGINS, false_early_rate=rate)
-    expected = choose_smoothing(found, grid, "validation")
+    expected = rule_sweep.choose_smoothing(found, grid, "validation")
     assert (SMOOTHINGS[s], MARGINS[m]) == (expected.smoothing, expected.margin)
 
 

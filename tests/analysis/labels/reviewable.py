@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
+import shutil
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -71,14 +73,9 @@ def pictures() -> np.ndarray:
 def events() -> EventChunk:
     """Two hundred before the slide, the rest evenly over it."""
     rng = np.random.default_rng(3)
-    times = np.sort(
-        np.concatenate(
-            [
-                rng.integers(START_NS // 1000, HOLD_NS // 1000, 200),
-                rng.integers(HOLD_NS // 1000, 590_000, EVENTS - 200),
-            ]
-        )
-    ).astype(np.int64)
+    early = rng.integers(START_NS // 1000, HOLD_NS // 1000, 200)
+    late = rng.integers(HOLD_NS // 1000, 590_000, EVENTS - 200)
+    times = np.sort(np.concatenate([early, late])).astype(np.int64)
     return EventChunk(
         rng.integers(0, 640, EVENTS).astype(np.uint16),
         rng.integers(0, 480, EVENTS).astype(np.uint16),
@@ -89,65 +86,43 @@ def events() -> EventChunk:
 
 def record(trial: str, condition: dict[str, str]) -> dict[str, Any]:
     """Return the record that a session would store for such a trial."""
-    clock = {
-        "map": {"device_ns": [0], "reference_ns": [0], "drift": [0]},
-        "uncertainty_ns": 1000.0,
-        "grade": "trigger input",
-    }
+    line = {"device_ns": [0], "reference_ns": [0], "drift": [0]}
+    clock = {"map": line, "uncertainty_ns": 1000.0, "grade": "trigger input"}
     steps = [("hold", START_NS, HOLD_NS), ("slide", HOLD_NS, 600_000_000)]
-    return {
-        "format": 1,
-        "trial": trial,
-        "campaign": NAME,
-        "experiment": "kinematic",
-        "role": "measured",
-        "block": 0,
-        "repetition": 1,
-        "attempt": 0,
-        "condition": condition,
-        "simulated": True,
-        "recorded_s": 0.6,
-        "motion_s": 1.0,
-        "counts": {"events": EVENTS, "frames": FRAMES, "poses": 50, "pulses": 12},
-        "clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock},
-        "quality": {
-            "passed": True,
-            "gates": {"frames_lost": {"value": 0, "limit": 0, "passed": True}},
-        },
-        "geometry": {
-            "centre": 0,
-            "event_px": [640, 480],
-            "frame_px": [SIZE, SIZE],
-            "px_per_mm": 5.0,
-            "skin_mm": SKIN_MM,
-        },
-        "steps": [
-            {"phase": phase, "start_ns": start, "end_ns": end, "recorded": True}
-            for phase, start, end in steps
-        ],
-        "simulation_truth": {
-            "incipient_ns": 310_000_000,
-            "gross_ns": 450_000_000,
-            "simulated": True,
-        },
-    }
+    gate = {"value": 0, "limit": 0, "passed": True}
+    truth = {"incipient_ns": 310_000_000, "gross_ns": 450_000_000, "simulated": True}
+    return (
+        {"format": 1, "trial": trial, "campaign": NAME, "experiment": "kinematic"}
+        | {"role": "measured", "block": 0, "repetition": 1, "attempt": 0, "condition": condition}
+        | {"simulated": True, "recorded_s": 0.6, "motion_s": 1.0, "simulation_truth": truth}
+        | {"counts": {"events": EVENTS, "frames": FRAMES, "poses": 50, "pulses": 12}}
+        | {"clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock}}
+        | {"quality": {"passed": True, "gates": {"frames_lost": gate}}}
+        | {
+            "geometry": {
+                "centre": 0,
+                "event_px": [640, 480],
+                "frame_px": [SIZE, SIZE],
+                "px_per_mm": 5.0,
+                "skin_mm": SKIN_MM,
+            },
+            "steps": [
+                {"phase": phase, "start_ns": start, "end_ns": end, "recorded": True}
+                for phase, start, end in steps
+            ],
+        }
+    )
 
 
 def label() -> dict[str, Any]:
     """The label of such a trial by the paper's rule: 2 px, 50 ms after a marker begins to move."""
     over = displacements() > 2.0
     slips = frame_times()[over.argmax(axis=0)]
-    return {
-        "incipient_ns": int(slips.min()),
-        "gross_ns": int(slips[0]),
-        "end_ns": 600_000_000,
-        "doubts": {"incipient": None, "gross": None},
-        "first_marker": 1,
-        "per_marker_ns": slips.tolist(),
-        "markers_lost": 0,
-        "plate_lost": 0,
-        "source": "video",
-    }
+    return (
+        {"incipient_ns": int(slips.min()), "gross_ns": int(slips[0]), "end_ns": 600_000_000}
+        | {"doubts": {"incipient": None, "gross": None}, "per_marker_ns": slips.tolist()}
+        | {"first_marker": 1, "markers_lost": 0, "plate_lost": 0, "source": "video"}
+    )
 
 
 class Reviewable:
@@ -165,6 +140,15 @@ class Reviewable:
             self.ids.append(trial.id)
         self.keys = {trial: self._label(trial) for trial in self.ids}
 
+    def copied(self, folder: Path) -> Self:
+        """The same in a folder of its own; files are linked, as nothing is written into one."""
+        made = copy.copy(self)
+        made.__dict__.pop("item", None)
+        made.keys = dict(self.keys)
+        shutil.copytree(self.store.folder, folder, copy_function=os.link)
+        made.store = Store.open(folder)
+        return made
+
     @cached_property
     def item(self) -> Collected:
         """The campaign as the steps see it."""
@@ -179,18 +163,8 @@ class Reviewable:
         known = label()
         old = Onsets(known["incipient_ns"], known["gross_ns"])
         seen = review.counts(self.store, NAME).get(trial, 0)
-        review.decide(
-            self.store,
-            NAME,
-            trial,
-            verdict,
-            label=self.keys[trial],
-            old=old,
-            new=new,
-            seen=seen,
-            who="anna",
-            why="because",
-        )
+        known = {"label": self.keys[trial], "old": old, "new": new, "seen": seen}
+        review.decide(self.store, NAME, trial, verdict, **known, who="anna", why="because")
 
     def _write(self, campaign: Campaign, trial: str, condition: dict[str, str]) -> None:
         writer = campaign.begin(trial, (SIZE, SIZE), 100)
@@ -225,21 +199,14 @@ class Reviewable:
         derived = Derived.of(self.store, STEP, NAME)
         data = label()
         if trial == self.ids[0]:
-            arrays = {
-                "frame_ns": frame_times(),
-                "displacement_px": displacements().astype(np.float32),
-                "xy_px": places(),
-            }
+            arrays = {"frame_ns": frame_times(), "xy_px": places()}
+            arrays["displacement_px"] = displacements().astype(np.float32)
             derived.write(trial, key, data, arrays)
             return key
         if len(self.ids) > DOUBTFUL and trial == self.ids[DOUBTFUL]:
             reason = "marker 3 could not be followed from 0.05 s after the motion began"
-            data |= {
-                "doubts": {"incipient": reason, "gross": reason},
-                "incipient_ns": None,
-                "gross_ns": None,
-                "markers_lost": 9,
-            }
+            data |= {"doubts": {"incipient": reason, "gross": reason}, "markers_lost": 9}
+            data |= {"incipient_ns": None, "gross_ns": None}
         os.link(derived.arrays_path(self.ids[0]), derived.arrays_path(trial))
         (derived.folder / f"{trial}.json").write_text(json.dumps({"key": key, **data}))
         return key

@@ -87,10 +87,8 @@ def test_an_onset_is_right_within_three_frames_or_in_doubt(
     onsets = paper_onsets(frame_ns, distance, 0, RULE, START)
     found = doubts(frame_ns, distance, 0, RULE, START)
     if found.incipient is None:
-        assert onsets.incipient_ns is not None
         assert abs(onsets.incipient_ns - 50 * FRAME_NS) <= MAX_UNSEEN_NS
     if found.gross is None:
-        assert onsets.gross_ns is not None
         assert abs(onsets.gross_ns - 90 * FRAME_NS) <= MAX_UNSEEN_NS
 
 

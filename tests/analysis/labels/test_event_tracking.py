@@ -7,14 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sliplab.analysis.labels.event_tracking import (
-    Discs,
-    EventTracks,
-    find_discs,
-    lost_slices,
-    track_discs,
-    without_hot_pixels,
-)
+from sliplab.analysis.labels import event_tracking
+from sliplab.analysis.labels.event_tracking import Discs, EventTracks, find_discs, lost_slices
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 from sliplab.storage.streams import EventChunk
 
@@ -65,10 +59,10 @@ def found(seen: EventChunk) -> Discs | None:
 
 
 def track(seen: EventChunk) -> EventTracks:
-    seen = without_hot_pixels(seen, SIZE)
+    seen = event_tracking.without_hot_pixels(seen, SIZE)
     discs = found(seen)
     assert discs is not None
-    return track_discs(seen, EDGES_US, discs, SETTLE)
+    return event_tracking.track_discs(seen, EDGES_US, discs, SETTLE)
 
 
 def errors(tracks: EventTracks) -> np.ndarray:
@@ -82,8 +76,7 @@ HARD = [{}, {"noise_hz": 0.1}, {"hot": 500}, {"contrast": 1.0}]
 
 @pytest.mark.parametrize("case", HARD, ids=str)
 def test_discs_are_found_wherever_they_are_and_however_large(case: dict[str, float]) -> None:
-    discs = found(without_hot_pixels(events(**case), SIZE))
-    assert discs is not None
+    discs = found(event_tracking.without_hot_pixels(events(**case), SIZE))
     assert discs.found.all()
     assert np.abs(discs.xy - rests()).max() < 1.0
     # 1.2 mm, and 0.4 mm/N under 0.3 N, at 14 px/mm
@@ -113,7 +106,6 @@ def test_a_disc_that_is_not_there_is_not_found() -> None:
     seen = events()
     torn = np.hypot(*(np.stack([seen.x, seen.y], 1) - rests()[4]).T) > 40
     discs = found(kept(seen, torn))
-    assert discs is not None
     assert discs.found.tolist() == [True] * 4 + [False] + [True] * 2
     tracks = track(kept(seen, torn))
     assert np.isnan(tracks.xy[:, 4]).all()

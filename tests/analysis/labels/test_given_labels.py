@@ -35,7 +35,6 @@ def test_onsets_and_their_uncertainty_are_those_of_the_data_set(tmp_path: Path) 
     label = label_of(tmp_path, given)
     assert (label.incipient_ns, label.gross_ns, label.end_ns) == (200 * MS, 500 * MS, 1000 * MS)
     assert label.doubts.incipient is label.doubts.gross is None
-    assert label.intervals is not None
     assert label.intervals.incipient_ns == (198 * MS, 202 * MS)
     assert label.by_rule("given").known_ns("gross") == 500 * MS
     with pytest.raises(ValueError, match="paper: is missing"):

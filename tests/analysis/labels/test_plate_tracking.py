@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sliplab.analysis.labels import plate_tracking
 from sliplab.analysis.labels.blobs import find_blobs
 from sliplab.analysis.labels.markers import track
-from sliplab.analysis.labels.plate_tracking import (
-    UNSEEN,
-    PlatePose,
-    PlateTracker,
-    bridge,
-    track_plate,
-    track_video,
-)
+from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge, track_plate
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
@@ -122,7 +116,7 @@ def test_a_bridge_is_straight() -> None:
     def pose(at: float) -> PlatePose:
         return PlatePose(True, corners_of(np.array([at, 0.0])), 0.01)
 
-    lost = UNSEEN
+    lost = plate_tracking.UNSEEN
     track_ = bridge([pose(0.0), lost, lost, lost, pose(8.0)])
     np.testing.assert_allclose(track_.xy[:, 0], [0, 2, 4, 6, 8], atol=1e-12)
     np.testing.assert_allclose(track_.corners[2], corners_of(np.array([4.0, 0.0])), atol=1e-12)
@@ -154,8 +148,7 @@ def test_a_video_in_one_pass() -> None:
         plates.append(np.array([340.0, 80.0 + 3.0 * i]))
         markers.append(at)
         frames.append(noisy(stick(frame.astype(np.uint8), plates[-1], 0.05), rng))
-    tracks = track_video(iter(frames), layout, with_plate=True)
-    assert tracks.plate is not None
+    tracks = plate_tracking.track_video(iter(frames), layout, with_plate=True)
     assert tracks.plate.ok.all()
     assert tracks.markers.ok.all()
     assert np.abs(tracks.plate.xy - plates).max() < 0.2
@@ -163,7 +156,7 @@ def test_a_video_in_one_pass() -> None:
     # the same as each alone
     np.testing.assert_array_equal(tracks.markers.xy, track(frames, layout).xy)
     np.testing.assert_array_equal(tracks.plate.corners, track_plate(frames).corners)
-    without = track_video(frames, layout, with_plate=False)
+    without = plate_tracking.track_video(frames, layout, with_plate=False)
     assert without.plate is None
     np.testing.assert_array_equal(without.markers.xy, tracks.markers.xy)
 

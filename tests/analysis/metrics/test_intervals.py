@@ -130,7 +130,6 @@ def test_a_median_of_few_lies_between_the_ranks_of_scipy() -> None:
         values = np.sort(RNG.gamma(4.0, 25.0, n))
         exact = stats.quantile_test(values, p=0.5).confidence_interval(0.95)
         found = interval(values, "median")
-        assert found is not None
         # no wider than whole ranks, and at most one rank narrower on either side
         a, b = (int(np.flatnonzero(values == edge)[0]) for edge in (exact.low, exact.high))
         assert values[a] <= found[0] <= values[a + 1]
@@ -155,8 +154,6 @@ def test_log_odds_of_many_trials_are_students() -> None:
     windows = np.full(400, 150.0)
     hits = RNG.binomial(150, RNG.beta(18, 2, 400))
     found, plain = share_interval(hits, windows), mean_interval(hits, windows)
-    assert found is not None
-    assert plain is not None
     assert found == pytest.approx(plain, abs=0.03 * (plain[1] - plain[0]))
 
 
@@ -173,7 +170,6 @@ def test_pairs_know_what_they_have_in_common() -> None:
     known = stats.ttest_rel(other, LATE).confidence_interval()
     assert difference(other, LATE, paired=True) == pytest.approx((known.low, known.high))
     loose = difference(other, LATE)
-    assert loose is not None
     assert loose[0] < 0 < known.low
     with pytest.raises(ValueError, match="no pairs"):
         difference([1.0, 2.0], [1.0, 2.0, 3.0], paired=True)
@@ -183,22 +179,19 @@ def test_trials_without_a_value_are_left_out_of_a_difference() -> None:
     gaps = LATE.copy()
     gaps[::3] = np.nan
     found = difference(gaps, LATE, "median", paired=True)
-    assert found is not None
     assert found[0] < np.nanmedian(gaps) - np.median(LATE) < found[1]
     assert difference([np.nan, np.nan, 1.0], [1.0, 2.0, 3.0], paired=True) is None
 
 
 def test_too_few_trials_have_no_interval() -> None:
-    assert interval([]) is None
-    assert interval([3.0]) is None
-    assert interval([3.0, 3.0, 3.0]) is None
-    assert interval(LATE[:5], "median") is None
-    assert interval(LATE[:71], "p95") is None
-    assert difference(LATE[:11], LATE, "median") is None
-    assert difference(LATE[:71], LATE, "p95") is None
+    for values in ([], [3.0], [3.0, 3.0, 3.0]):
+        assert interval(values) is None
+    for few, statistic in ((5, "median"), (71, "p95")):
+        assert interval(LATE[:few], statistic) is None
+    for few, statistic in ((11, "median"), (71, "p95")):
+        assert difference(LATE[:few], LATE, statistic) is None
     assert share_difference(([1.0], [2.0]), ([1.0], [2.0])) is None
-    assert share_interval([1.0], [2.0]) is None
-    assert share_interval([], []) is None
+    assert share_interval([1.0], [2.0]) is share_interval([], []) is None
     for bad in ([1.0, np.inf], [1.0, np.nan]):
         with pytest.raises(ValueError, match="finite"):
             interval(bad)
@@ -259,8 +252,6 @@ def test_rate_is_wider_where_few_clusters_have_all_events() -> None:
     hours = np.full(20, 0.1)
     alike = rate_interval(np.full(20, 3.0), hours)
     few = rate_interval(np.array([30.0, 30.0, *np.zeros(18)]), hours)
-    assert alike is not None
-    assert few is not None
     assert few[1] - few[0] > 3 * (alike[1] - alike[0])
 
 
@@ -269,7 +260,6 @@ def test_differences_between_strata_are_no_chance() -> None:
     counts, hours = np.array([30.0] * 4 + [0.0] * 16), np.full(20, 0.1)
     within = rate_interval(counts, hours, np.repeat(np.arange(5), 4).tolist())
     poisson = stats.chi2.ppf(0.975, 2 * 120 + 2) / 2 / 2
-    assert within is not None
     assert within[1] == pytest.approx(poisson)
     # strata of a single cluster say nothing of chance: they are compared with each other
     assert rate_interval(counts, hours, np.arange(20).tolist()) == rate_interval(counts, hours)
@@ -289,7 +279,6 @@ def test_median_of_worlds_knows_that_their_values_are_alike() -> None:
     low, high = median_interval(values, worlds.tolist()) or (np.nan, np.nan)
     assert (low, high) == pytest.approx((109.0, 161.0), abs=2.0)
     by_ranks = interval(values, "median")
-    assert by_ranks is not None
     assert high - low > 2 * (by_ranks[1] - by_ranks[0])
     assert median_interval(values[:250], worlds[:250].tolist()) is None, "five worlds"
 
@@ -313,7 +302,6 @@ def test_interval_of_a_median_of_ties_holds_it(rows: list[tuple[float, int]]) ->
 def test_difference_of_medians_counts_infinite_values() -> None:
     lost = np.r_[LATE[:150], np.full(30, np.inf)]
     found = difference(lost, LATE, "median", paired=True)
-    assert found is not None
     assert found[0] > 0, "as many slow ones as were lost"
     assert difference(np.r_[LATE[:80], np.full(100, np.inf)], LATE, "median") is None
     with pytest.raises(ValueError, match="infinite"):
@@ -324,7 +312,6 @@ def test_difference_of_medians_counts_infinite_values() -> None:
 def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
     values = [1.0, 2.0, 2.5, 3.0, 4.0, 90.0]
     free = interval([value - 30 for value in values], statistic)
-    assert free is not None
     assert free[0] < 0
     bounded = interval([value - 30 for value in values], statistic, least=0.0)
     assert bounded == (0.0, max(free[1], 0.0))
@@ -333,6 +320,5 @@ def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
 def test_cluster_of_a_stratum_alone_has_the_variance_of_its_count() -> None:
     """Five alike in one condition, and one in another: Poisson's interval, no narrower."""
     found = rate_interval([4.0] * 5 + [40.0], [0.1] * 6, ["a"] * 5 + ["b"])
-    assert found is not None
     assert found[1] == pytest.approx(stats.chi2.ppf(0.975, 122) / 2 / 0.6)
     assert found[0] == pytest.approx(stats.chi2.ppf(0.025, 120) / 2 / 0.6)

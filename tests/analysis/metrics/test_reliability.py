@@ -5,14 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from sliplab.analysis.metrics.reliability import (
-    by_lead,
-    calibration,
-    cross_entropy,
-    expected_calibration_error,
-    fit_temperature,
-    lead,
-)
+from sliplab.analysis.metrics import reliability
+from sliplab.analysis.metrics.reliability import by_lead, calibration, cross_entropy, lead
 
 
 def test_leads_are_counted_by_hand() -> None:
@@ -44,7 +38,7 @@ def test_temperature_has_a_closed_form_for_one_kind_of_lead() -> None:
     k, right, wrong = 6.0, 80, 20
     counts = np.tile([k, 0.0, -1e6], (right + wrong, 1))
     labels = np.repeat([0, 1], [right, wrong])
-    found = fit_temperature(counts, labels)
+    found = reliability.fit_temperature(counts, labels)
     assert found == pytest.approx(k / np.log(right / wrong), rel=1e-4)
     # nothing else gives less
     best = cross_entropy(counts, labels, found)
@@ -56,7 +50,7 @@ def test_calibration_error_by_hand() -> None:
     p = np.array([[0.9, 0.1, 0.0], [0.9, 0.1, 0.0], [0.5, 0.5, 0.0], [0.5, 0.3, 0.2]])
     labels = np.array([0, 1, 0, 0])
     # bin of 0.9: said 1.8, right 1; bin of 0.5: said 1.0, right a half (tie) and 1
-    assert expected_calibration_error(p, labels) == pytest.approx((0.8 + 0.5) / 4)
+    assert reliability.expected_calibration_error(p, labels) == pytest.approx((0.8 + 0.5) / 4)
 
 
 def test_drawn_from_the_said_probabilities_there_is_little_error() -> None:

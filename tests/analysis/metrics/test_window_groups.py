@@ -5,17 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
+from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.metrics.classification import accuracy
 from sliplab.analysis.metrics.intervals import share_interval
-from sliplab.analysis.metrics.window_groups import (
-    by_factor,
-    by_tenth,
-    by_trial,
-    credit,
-    mean,
-    share,
-    strict_hits,
-)
+from sliplab.analysis.metrics.window_groups import by_factor, by_tenth, credit, share, strict_hits
 
 COUNTS = np.array([[5, 0, 0], [3, 3, 0], [0, 0, 0], [0, 2, 1], [0, 0, 4], [9, 0, 0]])
 LABELS = np.array([0, 1, 2, 1, 2, 2])
@@ -41,7 +34,7 @@ def test_a_share_tells_windows_and_trials_and_its_interval() -> None:
     assert (found.low, found.high) == share_interval([1.0, 2.0], [3.0, 3.0])
     assert share(hits[:3], TRIAL[:3]).low is None
     assert share(hits[:0], TRIAL[:0]).share is None
-    ahead = mean(hits - 0.5, TRIAL)
+    ahead = window_groups.mean(hits - 0.5, TRIAL)
     assert ahead.share == 0.0
     assert ahead.low == pytest.approx(-ahead.high)
 
@@ -70,7 +63,9 @@ def test_tenths_of_a_phase() -> None:
 
 
 def test_the_worst_trial_comes_first() -> None:
-    rows = by_trial(COUNTS, LABELS, TRIAL, lambda number: ("slides", f"t{number}", {}))
+    rows = window_groups.by_trial(
+        COUNTS, LABELS, TRIAL, lambda number: ("slides", f"t{number}", {})
+    )
     assert [(row.trial, row.errors, row.n) for row in rows] == [("t4", 2, 3), ("t7", 1, 3)]
     assert rows[0].taken == {"incipient as undecided": 1, "gross as undecided": 1}
     assert rows[1].taken == {"gross as no_slip": 1}

@@ -106,6 +106,12 @@ def saved(
     return path
 
 
+def check_counts(found: Any, x: np.ndarray, expected: np.ndarray) -> None:
+    """Sinabs' own layers, our engine and the plain kernels count alike."""
+    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
+    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+
+
 @pytest.mark.parametrize("batch", [1, 7, 64])
 def test_weights_of_tenths_give_sinabs_own_counts(tmp_path: Path, batch: int) -> None:
     net, x = papers(0.1), windows(150, 0.2)
@@ -126,8 +132,7 @@ def test_on_the_grid_the_kernels_count_as_sinabs_does(tmp_path: Path, outputs: i
     assert found.on_grid()
     assert found.outputs_per_class == outputs / 3
     expected = by_hand(net, x, 50).reshape(100, -1, 3).sum(axis=1)
-    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
-    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    check_counts(found, x, expected)
     np.testing.assert_array_equal(spike_counts(found.fast(), x), expected)
 
 
@@ -136,9 +141,7 @@ def test_other_thresholds_are_kept(tmp_path: Path) -> None:
     layers = [dict(each) for each in OURS]
     layers[3]["threshold"] = 1.5
     found = load_external(saved(tmp_path, net, layers))
-    expected = by_hand(net, x, 60)
-    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
-    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    check_counts(found, x, by_hand(net, x, 60))
 
 
 def test_pools_leaks_and_sinabs_default_neurons(tmp_path: Path) -> None:
@@ -341,10 +344,7 @@ def test_other_classes_are_named(tmp_path: Path) -> None:
     names = ["cup", "spoon"]
     found = load_external(saved(tmp_path, net, classes=names, outputs=names * 3))
     assert found.outputs_per_class == 3
-    counts = found.sinabs().counts(x)
-    expected = by_hand(net, x, 64).reshape(-1, 3, 2).sum(axis=1)
-    np.testing.assert_array_equal(counts, expected)
-    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    check_counts(found, x, by_hand(net, x, 64).reshape(-1, 3, 2).sum(axis=1))
     with pytest.raises(InputError, match=r"outputs .*one of cup, spoon; gross is none"):
         load_external(saved(tmp_path, net, classes=names, outputs=["cup", "spoon", "gross"] * 2))
     with pytest.raises(InputError, match=r"classes .*must name each class once"):

@@ -14,16 +14,8 @@ import torch
 from torch import nn
 
 from sliplab.analysis.metrics.classification import IntArray
-from sliplab.analysis.networks.gradients import (
-    Batch,
-    EventDriven,
-    ExactConvolution,
-    OnDevice,
-    devices,
-    exact_net,
-    on_device,
-    work_on,
-)
+from sliplab.analysis.networks import gradients
+from sliplab.analysis.networks.gradients import Batch, EventDriven, OnDevice, devices, work_on
 from sliplab.analysis.networks.network import build, by_parameter, matrices, on_grid, set_weights
 from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.training import Fitted, fit
@@ -132,13 +124,13 @@ def test_a_gpu_trains_by_the_settings() -> None:
 def test_convolutions_as_products_give_the_same() -> None:
     net = build(Network(conv1_kernel=7, conv2_kernel=5), Windows(crop_px=140), 0)
     x = torch.from_numpy(np.random.default_rng(0).poisson(0.3, (5, 1, 7, 7)).astype(np.float32))
-    made: Any = exact_net(net)
+    made: Any = gradients.exact_net(net)
     one, theirs = made.conv1(x), dict(net.named_children())["conv1"](x)
     torch.testing.assert_close(one, theirs, rtol=0, atol=1e-5)
     two, theirs = made.conv2(one), dict(net.named_children())["conv2"](theirs)
     assert two.shape == theirs.shape == (5, 16, 4, 4)
     torch.testing.assert_close(two, theirs, rtol=0, atol=1e-4)
-    assert not isinstance(net.conv1, ExactConvolution)
+    assert not isinstance(net.conv1, gradients.ExactConvolution)
 
 
 def test_where_nothing_compiles_sinabs_computes_and_it_is_said(
@@ -150,7 +142,7 @@ def test_where_nothing_compiles_sinabs_computes_and_it_is_said(
     monkeypatch.setattr("sliplab.analysis.networks.gradients._compiled", lambda: (broken, broken))
     net = build(NETWORK, WINDOWS, 0)
     with pytest.warns(UserWarning, match="for cpu, Sinabs' layers compute: Cannot find a working"):
-        work = on_device(net, GAIN, "cpu")
+        work = gradients.on_device(net, GAIN, "cpu")
     work.take(on_grid(matrices(net)))
     x, y = samples(6, 1)
     with ThreadPoolExecutor(1) as pool:

@@ -8,19 +8,8 @@ import pytest
 import torch
 from sinabs.utils import validate_memory_mapping_speck
 
-from sliplab.analysis.networks.network import (
-    BIASED,
-    FIRST_BIAS,
-    FIRST_DRIVE,
-    SPIKING,
-    WEIGHTED,
-    build,
-    rates_alone,
-    reset_states,
-    set_weights,
-    spike_counts,
-    weights,
-)
+from sliplab.analysis.networks import network
+from sliplab.analysis.networks.network import SPIKING, WEIGHTED, build, spike_counts, weights
 from sliplab.protocols.settings import Network, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -70,7 +59,7 @@ def test_default_sizes_fit_the_chip() -> None:
         "fc2.weight": (12, 32),
         "fc2.bias": (12,),
     }
-    assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(BIASED)
+    assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(network.BIASED)
     plain = weights(build(Network(biases=False, outputs_per_class=1), Windows(), 0))
     assert list(plain) == [f"{name}.weight" for name in WEIGHTED]
     # on the chip a fully connected layer is a convolution over all of its input
@@ -89,8 +78,7 @@ def test_default_sizes_fit_the_chip() -> None:
 
 
 @pytest.mark.parametrize(
-    ("windows", "features"),
-    [(Windows(crop_px=140), 16 * 4 * 4), (Windows(polarity="both"), 1600)],
+    ("windows", "features"), [(Windows(crop_px=140), 16 * 4 * 4), (Windows(polarity="both"), 1600)]
 )
 def test_other_windows(windows: Windows, features: int) -> None:
     net = build(Network(), windows, 0)
@@ -113,7 +101,7 @@ def test_a_seed_decides_the_weights_and_nothing_else_random() -> None:
     second, other = weights(build(SMALL, WINDOWS, 3)), weights(build(SMALL, WINDOWS, 4))
     assert all(torch.equal(first[n], second[n]) for n in first)
     assert not any(torch.equal(first[n], other[n]) for n in first)
-    low, high = FIRST_BIAS
+    low, high = network.FIRST_BIAS
     assert ((first["fc1.bias"] >= low) & (first["fc1.bias"] <= high)).all()
 
 
@@ -122,7 +110,7 @@ def test_outputs_begin_alike_in_a_window_without_events(hidden: int) -> None:
     net = build(SMALL.model_copy(update={"hidden": hidden}), WINDOWS, 5)
     names = dict(net.named_children())
     steps = 840  # every rate of a neuron that fires within a window is a whole part of it
-    rates = rates_alone(names["fc1"].bias, WINDOWS.steps)
+    rates = network.rates_alone(names["fc1"].bias, WINDOWS.steps)
     neurons = names["iaf3"]
     current = names["fc1"].bias.detach().expand(steps, -1)
     neurons.num_timesteps = steps
@@ -132,7 +120,7 @@ def test_outputs_begin_alike_in_a_window_without_events(hidden: int) -> None:
     assert 0 < int(inside.sum()) < hidden
     torch.testing.assert_close(fired[inside], torch.floor(steps * rates[inside] + 1e-3))
     drive = names["fc2"].weight @ rates + names["fc2"].bias
-    torch.testing.assert_close(drive, torch.full((12,), FIRST_DRIVE))
+    torch.testing.assert_close(drive, torch.full((12,), network.FIRST_DRIVE))
 
 
 def test_weight_scale_belongs_to_its_layer() -> None:
@@ -160,7 +148,7 @@ def test_without_a_reset_states_would_leak() -> None:
     with torch.no_grad():
         net(x)
         assert any(getattr(net, n).v_mem.any() for n in SPIKING)
-        reset_states(net)
+        network.reset_states(net)
         assert not any(getattr(net, n).v_mem.any() for n in SPIKING)
 
 
@@ -184,9 +172,9 @@ def test_weights_that_do_not_fit_are_named() -> None:
     net = build(SMALL, WINDOWS, 0)
     good = weights(net)
     with pytest.raises(ValueError, match=r"fc2\.weight"):
-        set_weights(net, {k: v for k, v in good.items() if k != "fc2.weight"})
+        network.set_weights(net, {k: v for k, v in good.items() if k != "fc2.weight"})
     with pytest.raises(ValueError, match=r"fc2.weight has the shape \(8, 12\)"):
-        set_weights(net, good | {"fc2.weight": good["fc2.weight"].T})
+        network.set_weights(net, good | {"fc2.weight": good["fc2.weight"].T})
 
 
 def test_the_chip_vendors_package_is_never_imported() -> None:

@@ -23,17 +23,8 @@ from sliplab.analysis.networks.spiking import Job, Trainer, WindowLoss
 from sliplab.analysis.networks.spiking_gradients import _through
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Windows
-from tests.analysis.networks.test_spiking import (
-    FULL,
-    SMALL,
-    TAXELS,
-    TINY,
-    biased,
-    gridded,
-    on_own_grid,
-    put,
-    sparse,
-)
+from tests.analysis.networks import test_spiking
+from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, gridded, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -128,7 +119,7 @@ def test_gradients_are_sinabs_own(windows: Windows, share: float) -> None:
     for seed in range(2):
         x = sparse(6, windows, seed, share)
         y = torch.tensor([0, 1, 2, 0, 1, 2])
-        net = on_own_grid(build(network, windows, seed))
+        net = test_spiking.on_own_grid(build(network, windows, seed))
         _, fast = by_events(net, x, y, windows.cells)
         assert max(off(fast, by_sinabs(net, x, y))) <= 1e-6
         assert max(off(fast, in_double(net, x, y))) <= 1e-6
@@ -225,7 +216,7 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
         out, grads = by_events(net, x, y, TINY.cells)
         losses.append(nn.functional.cross_entropy(out.double(), y).item())
         values = matrices(net)
-        put(net, [w - 0.05 * g for w, g in zip(values, grads, strict=True)])
+        test_spiking.put(net, [w - 0.05 * g for w, g in zip(values, grads, strict=True)])
     assert min(losses[20:]) < losses[0] - 0.1
 
 
@@ -239,7 +230,7 @@ def test_gradients_of_any_number_of_classes(classes: int, windows: Windows) -> N
         outputs_per_class=2,
         weight_scale=(1.0, 3.0, 4.0, 3.0),
     )
-    net = on_own_grid(biased(build(network, windows, 3, classes), 3))
+    net = test_spiking.on_own_grid(biased(build(network, windows, 3, classes), 3))
     x = sparse(4, windows, 5, 0.13 if windows is TAXELS else 0.3)
     y = torch.arange(4) * 7 % classes
     counts, fast = by_events(net, x, y, windows.cells)

@@ -5,17 +5,9 @@ import pytest
 
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics.classification import CLASSES, score
+from sliplab.analysis.networks import window_checks
 from sliplab.analysis.networks.training import Fitted, fit
-from sliplab.analysis.networks.window_checks import (
-    Chance,
-    CheckFailed,
-    Part,
-    balanced,
-    check_chance,
-    check_permutations,
-    permuted,
-    shuffled_chance,
-)
+from sliplab.analysis.networks.window_checks import CheckFailed, check_chance, check_permutations
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.schema.evaluation import Classification
@@ -29,7 +21,7 @@ HOW = Training(
 )
 
 
-def places(n: int, seed: int) -> Part:
+def places(n: int, seed: int) -> window_checks.Part:
     """Each class has events of its own corner."""
     rng = np.random.default_rng(seed)
     y = rng.permutation(np.arange(n) % 3)
@@ -43,8 +35,8 @@ def places(n: int, seed: int) -> Part:
 TRAIN, VALIDATION, TEST = places(150, 0), places(60, 1), places(90, 2)
 
 
-def chance(**changes: object) -> Chance:
-    return shuffled_chance(
+def chance(**changes: object) -> window_checks.Chance:
+    return window_checks.shuffled_chance(
         TRAIN, VALIDATION, TEST, NETWORK, WINDOWS, HOW, runs=8, per_class=40, level=0.99, **changes
     )  # type: ignore[arg-type]  # whatever the test changes
 
@@ -65,18 +57,18 @@ def test_labels_that_were_not_really_shuffled_are_found_out() -> None:
 
 def test_a_training_that_learns_nothing_checks_nothing() -> None:
     with pytest.raises(CheckFailed, match="learned nothing"):
-        check_chance(Chance((0.33, 0.34), 0.2, 0.5, 0.4, 0.999))
+        check_chance(window_checks.Chance((0.33, 0.34), 0.2, 0.5, 0.4, 0.999))
 
 
 def test_balanced_parts_have_as_many_of_each_class() -> None:
     x, y = TRAIN
     rows = np.flatnonzero((y != 2) | (np.arange(len(y)) % 5 == 0))
-    windows, labels = balanced((x.take(rows), y[rows]), 30, 0)
+    windows, labels = window_checks.balanced((x.take(rows), y[rows]), 30, 0)
     sizes = np.bincount(labels)
     assert set(sizes.tolist()) == {min(30, int((y[rows] == 2).sum()))}
     assert len(windows) == sizes.sum()
     with pytest.raises(ValueError, match="every class"):
-        balanced((x, np.zeros(len(y), np.int64)), 30, 0)
+        window_checks.balanced((x, np.zeros(len(y), np.int64)), 30, 0)
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +77,10 @@ def fitted() -> Fitted:
 
 
 def test_permuted_outputs_change_no_figure(fitted: Fitted) -> None:
-    assert check_permutations(permuted(fitted, TEST[0]), TEST[1], score) == 6
-    straight, turned = (permuted(fitted, TEST[0])(order) for order in ((0, 1, 2), (2, 0, 1)))
+    assert check_permutations(window_checks.permuted(fitted, TEST[0]), TEST[1], score) == 6
+    straight, turned = (
+        window_checks.permuted(fitted, TEST[0])(order) for order in ((0, 1, 2), (2, 0, 1))
+    )
     np.testing.assert_array_equal(turned, straight[:, [2, 0, 1]])
     assert straight.any()
 

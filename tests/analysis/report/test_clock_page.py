@@ -64,33 +64,22 @@ def made(campaign: str, count: int, *, wired: bool) -> list[TrialClocks]:
         arm = ("digital input", 2.0, 1000.0) if wired else ("host time", 9000.0, 15000.0)
         missed = (int(rng.poisson(0.4)) + 9 * (k == 2), int(rng.poisson(0.1)), 0)
         pulses = (0, 1, 0) if wired else None
-        trials.append(
-            Made(
-                campaign,
-                f"depth=2.4mm,direction={k}deg,r=1",
-                k + 1,
-                {
-                    "events": device(
-                        "trigger input", 0.6 + rng.exponential(0.2), 1000.0, warm - 25, missed
-                    ),
-                    "frames": device(
-                        grade, wide * (1 + rng.exponential(0.3)), 5000.0, warm, pulses
-                    ),
-                    "arm": device(
-                        arm[0], arm[1] * (1 + rng.exponential(0.1)), arm[2], warm - 43, pulses
-                    ),
-                },
-                k == 0,
-                {"frames": "residuals: a clock jumped"} if k == 1 else {},
-                int(rng.poisson(0.05)),
-                Derived(Path("nowhere")),
-                {
-                    f"{name}{unit}": values
-                    for name in (("events", "frames", "arm") if wired else ("events",))
-                    for unit, values in (("_s", time_s), ("_us", rng.normal(0, 2, 90)))
-                },
-            )
-        )
+        shown = {
+            "events": ("trigger input", 0.6 + rng.exponential(0.2), 1000.0, warm - 25, missed),
+            "frames": (grade, wide * (1 + rng.exponential(0.3)), 5000.0, warm, pulses),
+            "arm": (arm[0], arm[1] * (1 + rng.exponential(0.1)), arm[2], warm - 43, pulses),
+        }
+        devices = {name: device(*values) for name, values in shown.items()}
+        refused = {"frames": "residuals: a clock jumped"} if k == 1 else {}
+        late = int(rng.poisson(0.05))
+        residuals = {
+            f"{name}{unit}": values
+            for name in (("events", "frames", "arm") if wired else ("events",))
+            for unit, values in (("_s", time_s), ("_us", rng.normal(0, 2, 90)))
+        }
+        name, where = f"depth=2.4mm,direction={k}deg,r=1", Derived(Path("nowhere"))
+        known = (campaign, name, k + 1, devices, k == 0, refused, late, where, residuals)
+        trials.append(Made(*known))
     return trials
 
 
@@ -102,9 +91,10 @@ def set_aside(folder: Path, name: str, gates: dict[str, Any]) -> None:
     write_json(path / "cause.json", {"cause": "gate: something", "trial": name, "attempt": 1})
 
 
-@pytest.fixture
-def page(tmp_path: Path) -> str:
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Two campaigns, of which the second has wires to the event camera alone."""
+    tmp_path = tmp_path_factory.mktemp("page")
     far = {"value": 0.0042, "limit": 0.001, "grade": "digital input", "passed": False}
     none = {"value": "ambiguous: the train fits twice", "limit": None, "passed": False}
     set_aside(tmp_path, "r=1", {"sync_uncertainty_arm_s": far})

@@ -5,22 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sliplab.analysis.detectors import onset_references
 from sliplab.analysis.detectors.latency import TrueSlip
-from sliplab.analysis.detectors.onset_references import (
-    Decided,
-    Name,
-    OnsetReference,
-    judge_by_reference,
-)
+from sliplab.analysis.detectors.onset_references import Decided, Name, OnsetReference
 from sliplab.analysis.detectors.smoothing_rule import Found
 from sliplab.analysis.report.onsets import Explained, OnsetSection, onset_section
 from sliplab.analysis.report.page import render_section
-from sliplab.storage.schema.evaluation import (
-    DetectorComparison,
-    DetectorRate,
-    DetectorScores,
-    OnsetFigures,
-)
+from sliplab.storage.schema import evaluation
+from sliplab.storage.schema.evaluation import DetectorComparison, DetectorRate, OnsetFigures
 from sliplab.storage.schema.summary import Kinematic, Network, Summary
 
 MS = 1_000_000
@@ -39,7 +31,7 @@ def figures(
     *incipient_ms: int | None, references: Mapping[Name, OnsetReference]
 ) -> dict[str, OnsetFigures]:
     """Decisions on trials with the same onsets; those of gross slip at 1550 ms."""
-    return judge_by_reference(
+    return onset_references.judge_by_reference(
         [
             Decided(Found(None if at is None else at * MS, 1550 * MS), references, 30 * MS)
             for at in incipient_ms
@@ -52,7 +44,7 @@ def summary(
 ) -> Summary:
     """A summary of these rows alone; a network of another title has those of the store's own."""
     scores = tuple(
-        DetectorScores.model_construct(
+        evaluation.DetectorScores.model_construct(
             name=name,
             stride_ms=30,
             curve=(),
@@ -131,7 +123,6 @@ def test_real_data_name_no_true_onset() -> None:
 def test_an_older_evaluation_has_rows_of_networks_and_none_of_detectors() -> None:
     own = figures(1020, references={**LABEL, **TRUE})
     section = onset_section(summary(own, {"smoothing": {}}))
-    assert section is not None
     assert section.allowed is None
     assert {row[0] for row in section.table.rows} == {
         "this store's network and rule",

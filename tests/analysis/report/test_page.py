@@ -5,18 +5,13 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
+from functools import partial
 from xml.etree import ElementTree
 
 import pytest
 
-from sliplab.analysis.report.figures import campaign, clocks, trials
-from sliplab.analysis.report.figures.intervals import (
-    Panel,
-    Share,
-    by_condition,
-    differences,
-    shares,
-)
+from sliplab.analysis.report.figures import campaign, clocks, intervals, trials
+from sliplab.analysis.report.figures.intervals import Panel, Share, by_condition, differences
 from sliplab.analysis.report.outcomes import FailureSection
 from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
 from sliplab.analysis.report.trial import TrialSection
@@ -28,74 +23,56 @@ EVIL = "<img src=x onerror=alert(1)>"
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
 ROWS = ["0.165 kg, 0.3 mm/s", "0.205 kg, 0.3 mm/s"]
 
-DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
+LEAD = Panel(
+    "lead (ms)",
+    {ROWS[0]: [360.0, 420.0]},
+    zero="gross slip",
+    published=(360.0, "paper's smallest"),
+    notes={ROWS[0]: "2 missed"},
+)
+DEPTHS = [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]
+POINTS = [Point({"x": 10.0, "y": 90.0}, True, False), Point({"x": 20.0, "y": 95.0}, False, True)]
+WINDOWS = "windows classified correctly (%)"
+DRAWN: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "by_condition": (
-        lambda simulated: by_condition(
-            ROWS,
-            [
-                Panel(
-                    "lead (ms)",
-                    {ROWS[0]: [360.0, 420.0]},
-                    zero="gross slip",
-                    published=(360.0, "paper's smallest"),
-                    notes={ROWS[0]: "2 missed"},
-                )
-            ],
-            simulated=simulated,
-            breaks=[1],
-        ),
+        partial(by_condition, ROWS, [LEAD], breaks=[1]),
         ("lead (ms)", *ROWS, "0: gross slip", "dotted: paper's smallest", "2 missed", "none"),
     ),
     "shares": (
-        lambda simulated: shares(
-            {"depth": [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]},
-            "windows classified correctly (%)",
-            simulated=simulated,
-            line=(0.92, "all"),
-        ),
-        ("windows classified correctly (%)", "depth", "2.4 mm", "2.6 mm", "all"),
+        partial(intervals.shares, {"depth": DEPTHS}, WINDOWS, line=(0.92, "all")),
+        (WINDOWS, "depth", "2.4 mm", "2.6 mm", "all"),
     ),
-    "differences": (
-        lambda simulated: differences([("lead", 12.0, 3.0, 20.0)], "ms", simulated=simulated),
-        ("lead", "ms"),
-    ),
+    "differences": (partial(differences, [("lead", 12.0, 3.0, 20.0)], "ms"), ("lead", "ms")),
     "over_campaign": (
-        lambda simulated: campaign.over_campaign(
-            [1, 2, 4], [1e4, 2e4, 1e4], [0.1, 0.2, 0.1], {3: 2}, simulated=simulated
-        ),
+        partial(campaign.over_campaign, [1, 2, 4], [1e4, 2e4, 1e4], [0.1, 0.2, 0.1], {3: 2}),
         ("(thousand/s)", "(% of its limit)", "attempts", "trial, in the plan's order"),
     ),
     "references": (
-        lambda simulated: campaign.references(
+        partial(
+            campaign.references,
             [1, 5],
             {"events (1/s)": [10.0, 11.0], "first slip (ms)": [None, 900.0]},
-            simulated=simulated,
         ),
         ("events (1/s)", "first slip (ms)"),
     ),
     "clocks": (
-        lambda simulated: clocks.uncertainty_by_trial(
-            {"events, trigger input": ([1, 2], [0.3, 0.4])}, {"kinematic": 1}, simulated=simulated
+        partial(
+            clocks.uncertainty_by_trial,
+            {"events, trigger input": ([1, 2], [0.3, 0.4])},
+            {"kinematic": 1},
         ),
         ("uncertainty, 95 % (µs)", "kinematic", "events, trigger input"),
     ),
     "labels": (
-        lambda simulated: trials.label_uncertainty(
+        partial(
+            trials.label_uncertainty,
             {"paper's rule": {"incipient": [1.0, 4.0], "gross": [2.0]}},
             {"incipient": [3.0], "gross": []},
-            simulated=simulated,
         ),
         ("distance from the truth (ms)", "width of its 95 % interval (ms)"),
     ),
     "front": (
-        lambda simulated: cost_and_error(
-            [
-                Point({"x": 10.0, "y": 90.0}, True, False),
-                Point({"x": 20.0, "y": 95.0}, False, True),
-            ],
-            [Pair("x", "y", "work (µs/s)", "latency (ms)")],
-            simulated=simulated,
-        ),
+        partial(cost_and_error, POINTS, [Pair("x", "y", "work (µs/s)", "latency (ms)")]),
         ("work (µs/s)", "latency (ms)", "Pareto front", "paper's settings"),
     ),
 }
@@ -109,13 +86,13 @@ def render(*sections: Content, simulated: bool = False) -> str:
 @pytest.mark.parametrize("name", sorted(DRAWN))
 def test_figures_are_whole_and_say_what_they_are(name: str) -> None:
     draw, words = DRAWN[name]
-    text = draw(True)
+    text = draw(simulated=True)
     tree = ElementTree.fromstring(text)
     found = "\n".join(item.text or "" for item in tree.iter() if item.tag.endswith("}text"))
     for word in (*words, "simulated"):
         assert word in found
-    assert text == draw(True)  # the same bytes again
-    assert "simulated" not in draw(False)
+    assert text == draw(simulated=True)  # the same bytes again
+    assert "simulated" not in draw(simulated=False)
 
 
 def test_a_figures_data_are_columns_with_units() -> None:

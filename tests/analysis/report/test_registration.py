@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from tests.flows.older import older_store
 def deviations(store: Store) -> dict[str, tuple[str, str]]:
     """Registered and found by name, but for versions: the store is an older one's."""
     section = registration_section(store, collected(store))
-    assert section is not None
     (campaign,) = section.campaigns
     assert campaign.after == "after 4 trials"
     return {
@@ -30,12 +30,18 @@ def deviations(store: Store) -> dict[str, tuple[str, str]]:
     }
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with an evaluation, registered as it is."""
-    found = Store.open(older_store(tmp_path / "store"))
+    found = Store.open(older_store(tmp_path_factory.mktemp("registered") / "store"))
     register(found.campaign("small").protocol_file, found.folder, campaign="small")
-    return found
+    return found.folder
+
+
+@pytest.fixture
+def store(registered: Path, tmp_path: Path) -> Store:
+    """A copy of it, to be changed at will."""
+    return Store.open(shutil.copytree(registered, tmp_path / "store"))
 
 
 def evaluated(store: Store, **changes: Any) -> None:
@@ -102,7 +108,6 @@ def test_changed_or_missing_registration_proves_nothing(store: Store, deleted: b
         path.chmod(0o644)
         path.write_text(path.read_text().replace("2026", "2025"))
     section = registration_section(store, collected(store))
-    assert section is not None
     (shown,) = section.campaigns
     assert shown.after == "but its registrations are damaged, missing or changed"
     assert shown.deviations.rows[0][0] == "damaged registration"

@@ -15,15 +15,8 @@ from sliplab.analysis.report.outcomes import trial_intervals
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import (
-    Accuracy,
-    AlarmRate,
-    Seeds,
-    SeedScores,
-    Share,
-    Spread,
-    TrialLatency,
-)
+from sliplab.storage.schema import evaluation
+from sliplab.storage.schema.evaluation import Accuracy, AlarmRate, Seeds, SeedScores, TrialLatency
 from sliplab.storage.schema.summary import Experiment, Kinematic, Network, Summary, TrialOutcome
 
 
@@ -32,31 +25,24 @@ def seeds(*strict: float) -> Seeds:
         SeedScores(seed=k, chosen=not k, validation_strict=None, strict=it, argmax=it, margin=it)
         for k, it in enumerate(strict)
     )
-    spread = Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
+    spread = evaluation.Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
     return Seeds(each=each, spread={"strict": spread})
 
 
 def outcome(experiment: str, lead_ms: float | None, gross: str) -> TrialOutcome:
-    return TrialOutcome.model_validate(
-        {
-            "campaign": "c",
-            "experiment": experiment,
-            "trial": f"{experiment} {lead_ms}",
-            "outcome": "missed" if lead_ms is None else "detected_first",
-            "gross": gross,
-            "duration_ms": 900.0,
-            "latency_incipient_ms": None if lead_ms is None else 90.0,
-            "latency_gross_ms": 20.0 if gross == "detected" else None,
-            "lead_ms": lead_ms,
-        }
-    )
+    times = {"lead_ms": lead_ms, "latency_gross_ms": 20.0 if gross == "detected" else None}
+    times |= {"duration_ms": 900.0, "latency_incipient_ms": None if lead_ms is None else 90.0}
+    became = {"outcome": "missed" if lead_ms is None else "detected_first", "gross": gross}
+    names = {"campaign": "c", "experiment": experiment, "trial": f"{experiment} {lead_ms}"}
+    return TrialOutcome.model_validate(names | became | times)
+
+
+TIMES = ("latency_incipient_ms", "latency_gross_ms", "lead_ms")
 
 
 def latency(row: TrialOutcome) -> TrialLatency:
     return TrialLatency(
-        latency_incipient_ms=row.latency_incipient_ms,
-        latency_gross_ms=row.latency_gross_ms,
-        lead_ms=row.lead_ms,
+        **{name: getattr(row, name) for name in TIMES},
         late_incipient_ms=None,
         late_gross_ms=500.0 if row.gross == "late" else None,
         missed_incipient=row.outcome == "missed",
@@ -68,12 +54,8 @@ def latency(row: TrialOutcome) -> TrialLatency:
 
 def figures(rows: Sequence[TrialOutcome]) -> dict[str, Any]:
     scored = [latency(row) for row in rows]
-    return {
-        "trials": len(rows),
-        "latency_ms": summarise_latency(scored),
-        "lead_ms": summarise_lead(scored),
-        "by_seed": (),
-    }
+    found = {"latency_ms": summarise_latency(scored), "lead_ms": summarise_lead(scored)}
+    return {"trials": len(rows), "by_seed": (), **found}
 
 
 def summary(alarms: dict[str, AlarmRate], of_seeds: Seeds) -> Summary:
@@ -83,7 +65,7 @@ def summary(alarms: dict[str, AlarmRate], of_seeds: Seeds) -> Summary:
     kinematic = Kinematic.model_construct(
         accuracy=Accuracy(argmax=0.91, strict=0.9, margin=0.8, n=450),
         seeds=of_seeds,
-        interval=Share(share=0.9, low=0.8, high=0.95, n=450, trials=3),
+        interval=evaluation.Share(share=0.9, low=0.8, high=0.95, n=450, trials=3),
         false_alarms=alarms,
         **figures(slides),
     )
@@ -173,11 +155,8 @@ def test_no_interval_reaches_below_what_can_be() -> None:
         for row, ms in zip(rows, (-20.0, 0.0, 200.0), strict=True)
     ]
     found = trial_intervals(rows, [Detection(false_early_ms=30)])
-    assert found.lead_ms.mean is not None
     assert found.lead_ms.mean[0] == 0.0
-    assert found.latency_gross_ms.mean is not None
     assert found.latency_gross_ms.mean[0] == -30.0
     free = trial_intervals(rows)
-    assert free.latency_gross_ms.mean is not None
     assert free.latency_gross_ms.mean[0] is not None
     assert free.latency_gross_ms.mean[0] < -30.0

@@ -6,21 +6,15 @@ import pytest
 
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.windows import WorkSection, work_section
-from sliplab.storage.schema.evaluation import (
-    Seeds,
-    SeedScores,
-    Share,
-    Spread,
-    TrainedBaseline,
-    WindowWork,
-)
+from sliplab.storage.schema import evaluation
+from sliplab.storage.schema.evaluation import Seeds, SeedScores, Share, Spread, TrainedBaseline
 from sliplab.storage.schema.summary import Kinematic
 
 
 def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSection, str]:
     """The section of a network with these accuracies, and a rival's; and its words."""
     layers = {"conv1": 10.0, "all": 10.0}
-    work = WindowWork(
+    work = evaluation.WindowWork(
         synaptic_operations=layers,
         dense_multiply_adds={"conv1": 100, "all": 100},
         share=0.1,

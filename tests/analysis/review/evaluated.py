@@ -17,21 +17,8 @@ from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification, window_groups
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import (
-    Calibration,
-    Coverage,
-    Deviation,
-    DeviationByOnset,
-    Evaluation,
-    LabelErrors,
-    NoSlip,
-    RuleErrors,
-    SampleCounts,
-    Seeds,
-    Share,
-    TrialScore,
-    WindowScores,
-)
+from sliplab.storage.schema import evaluation
+from sliplab.storage.schema.evaluation import Calibration, Coverage, Deviation, NoSlip, TrialScore
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from tests.analysis.labels.reviewable import NAME, Reviewable
@@ -41,7 +28,7 @@ TRIALS = 110
 """12 of them are test trials."""
 RULE = Detection()
 NOTHING = Deviation(n=0, median=None, median_abs=None, max_abs=None)
-NO_SHARE = Share(share=None, low=None, high=None, n=0, trials=0)
+NO_SHARE = evaluation.Share(share=None, low=None, high=None, n=0, trials=0)
 
 
 class Evaluated(Reviewable):
@@ -112,13 +99,13 @@ class Evaluated(Reviewable):
         said = np.where(rng.random(len(test)) < 0.7, test.y, rng.integers(0, 3, len(test)))
         counts = np.eye(3, dtype=np.int64)[said]
         hits = window_groups.strict_hits(counts, test.y)
-        by_onset = DeviationByOnset(incipient=NOTHING, gross=NOTHING)
-        kept = Evaluation(
+        by_onset = evaluation.DeviationByOnset(incipient=NOTHING, gross=NOTHING)
+        kept = evaluation.Evaluation(
             format=evaluations.FORMAT,
             seed=0,
             trials=tuple(rows),
             experiments=summaries(rows),
-            windows=WindowScores(
+            windows=evaluation.WindowScores(
                 **dict(classification.score(counts, test.y, 2.0)),
                 interval=window_groups.share(hits, test.trial),
                 reliability=(),
@@ -129,14 +116,14 @@ class Evaluated(Reviewable):
                 by_tenth={},
                 no_slip=NoSlip(hold=NO_SHARE, loading=NO_SHARE),
                 by_trial=(),
-                seeds=Seeds(each=(), spread={}),
+                seeds=evaluation.Seeds(each=(), spread={}),
                 work=None,
                 baselines={},
                 beside={},
-                samples=SampleCounts(train=len(train), test=len(test)),
+                samples=evaluation.SampleCounts(train=len(train), test=len(test)),
             ),
-            label_error_ms=LabelErrors(rule="paper", **dict(by_onset)),
-            label_rules_ms=RuleErrors(
+            label_error_ms=evaluation.LabelErrors(rule="paper", **dict(by_onset)),
+            label_rules_ms=evaluation.RuleErrors(
                 paper=by_onset,
                 change_point=by_onset,
                 apart=by_onset,

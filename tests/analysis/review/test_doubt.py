@@ -27,10 +27,16 @@ INCIPIENT, GROSS = 315 * MS, 455 * MS
 HIDDEN = "marker 3 could not be followed from 0.05 s after the motion began"
 
 
-@pytest.fixture
-def made(tmp_path: Path) -> Reviewable:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Reviewable:
     """Trials of two speeds and more depths, directions."""
-    return Reviewable(tmp_path / "s", COUNT)
+    return Reviewable(tmp_path_factory.mktemp("doubt") / "s", COUNT)
+
+
+@pytest.fixture
+def made(whole: Reviewable, tmp_path: Path) -> Reviewable:
+    """A copy of them, to be changed at will."""
+    return whole.copied(tmp_path / "s")
 
 
 def relabel(made: Reviewable, trial: str, **values: Any) -> None:
@@ -45,12 +51,8 @@ def doubts(made: Reviewable) -> dict[str, LabelDoubt]:
 
 
 def onsets(incipient: int | None, gross: int | None, **others: Any) -> dict[str, Any]:
-    return {
-        "incipient_ns": incipient,
-        "gross_ns": gross,
-        "per_marker_ns": [GROSS, INCIPIENT],
-        **others,
-    }
+    found = {"incipient_ns": incipient, "gross_ns": gross, "per_marker_ns": [GROSS, INCIPIENT]}
+    return found | others
 
 
 def test_the_label_is_what_the_fixture_says() -> None:

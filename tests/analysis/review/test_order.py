@@ -22,12 +22,19 @@ from tests.analysis.labels.reviewable import NAME
 from tests.analysis.review.evaluated import MS, TRIALS, Evaluated
 
 GRAVE = "marker 3 could not be followed from 0.05 s after the motion began"
+GRAVELY = {"incipient_ns": None, "gross_ns": None, "doubts": {"incipient": GRAVE, "gross": GRAVE}}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    """A hundred trials and ten, whose labels are in no doubt."""
+    return Evaluated(tmp_path_factory.mktemp("order") / "s")
 
 
 @pytest.fixture
-def made(tmp_path: Path) -> Evaluated:
-    """A hundred trials and ten, whose labels are in no doubt."""
-    return Evaluated(tmp_path / "s")
+def made(whole: Evaluated, tmp_path: Path) -> Evaluated:
+    """A copy of them, to be changed at will."""
+    return whole.copied(tmp_path / "s")
 
 
 def order(made: Evaluated) -> ReviewOrder:
@@ -35,11 +42,7 @@ def order(made: Evaluated) -> ReviewOrder:
 
 
 def figure(found: ReviewOrder, name: str) -> Figure:
-    (one,) = [
-        figure
-        for figure in found.figures
-        if (figure.name, figure.experiment) == (name, "kinematic")
-    ]
+    (one,) = [it for it in found.figures if (it.name, it.experiment) == (name, "kinematic")]
     return one
 
 
@@ -125,9 +128,7 @@ def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: st
     elif case == "drops out":
         made.change(trial, flags=["knocked"])
     else:
-        made.change(
-            trial, incipient_ns=None, gross_ns=None, doubts={"incipient": GRAVE, "gross": GRAVE}
-        )
+        made.change(trial, **GRAVELY)
         if case == "comes and moves":
             made.widen(trial, 45.0, 45.0)
     latencies = np.random.default_rng(3).uniform(-40, 140, len(made.tests)).tolist()
@@ -143,12 +144,9 @@ def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: st
         assert figure(found, name).value == pytest.approx(of(before, name), abs=1e-9)
     seen = set()
     for draw in range(0, DRAWS, 10):
-        onsets = {"incipient_ns": None, "gross_ns": None}
-        if drawn.usable[draw]:
-            onsets = {
-                "incipient_ns": int(drawn.incipient_ns[draw]),
-                "gross_ns": int(drawn.gross_ns[draw]),
-            }
+        kinds = ("incipient_ns", "gross_ns")
+        usable = drawn.usable[draw]
+        onsets = {kind: int(getattr(drawn, kind)[draw]) if usable else None for kind in kinds}
         again = moved_rows(made, rows, place, full.model_copy(update=onsets))
         after = summaries(again)["kinematic"]
         seen.add(again[place].latency is None)
@@ -190,7 +188,7 @@ def test_training_trials_move_training_and_nothing_else(made: Evaluated) -> None
     gone, moved, come = made.trained[:3]
     made.change(gone, flags=["knocked"])
     made.widen(moved, 30.0, 0.0)
-    made.change(come, incipient_ns=None, gross_ns=None, doubts={"incipient": GRAVE, "gross": GRAVE})
+    made.change(come, **GRAVELY)
     made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
     found = order(made)
     shares = {item.trial: item.moves[0].change for item in found.trials}
@@ -243,9 +241,8 @@ def test_without_a_current_evaluation_doubt_alone_orders(made: Evaluated) -> Non
 
 def test_decisions_tell_how_many_are_unusable(made: Evaluated) -> None:
     """Ten assumed trials and six decided ones: of those in grave doubt all were rejected."""
-    doubt = {"incipient_ns": None, "gross_ns": None, "doubts": {"incipient": GRAVE, "gross": GRAVE}}
     for trial in made.tests[:7]:
-        made.change(trial, **doubt)
+        made.change(trial, **GRAVELY)
     for trial in made.tests[:6]:
         made.decide(trial, "reject", Onsets())
     (item,) = order(made).trials

@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.analysis.windows.displacement import (
-    FRAMES,
-    _held,
-    all_frames,
-    choose_frames,
-    cut_frames,
-)
+from sliplab.analysis.windows import displacement
+from sliplab.analysis.windows.displacement import FRAMES, _held, choose_frames, cut_frames
 
 
 def slide(frames: int = 12, markers: int = 4, seed: int = 1) -> np.ndarray:
@@ -37,7 +32,7 @@ def test_a_turned_slide_with_other_markers_gives_the_same_windows() -> None:
 
 def test_lengths_are_kept_and_the_furthest_marker_comes_first() -> None:
     moved = slide(markers=7)
-    x, newest = all_frames(moved)
+    x, newest = displacement.all_frames(moved)
     assert newest.tolist() == list(range(FRAMES - 1, 12))
     lengths = np.hypot(x[:, -1, :, 0], x[:, -1, :, 1])
     assert (np.diff(lengths, axis=1) <= 1e-6).all()

@@ -7,14 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.windows.samples import (
-    GROSS,
-    INCIPIENT,
-    NO_SLIP,
-    choose_windows,
-    consecutive_windows,
-    strided_windows,
-)
+from sliplab.analysis.windows import samples
+from sliplab.analysis.windows.samples import INCIPIENT, NO_SLIP, choose_windows, consecutive_windows
 
 MS = 1_000_000
 WINDOW = 30 * MS
@@ -49,7 +43,7 @@ def test_the_papers_case() -> None:
     chosen = choose_windows(T0, end, incipient, gross, WINDOW, 50, seed=3)
     assert chosen[NO_SLIP][-1] + WINDOW == incipient
     assert chosen[NO_SLIP][0] == incipient - 50 * WINDOW
-    assert chosen[GROSS].tolist() == [gross + i * WINDOW for i in range(50)]
+    assert chosen[samples.GROSS].tolist() == [gross + i * WINDOW for i in range(50)]
     gaps = np.diff(chosen[INCIPIENT]) - WINDOW
     assert len(chosen[INCIPIENT]) == 50
     assert gaps.min() >= 0
@@ -90,14 +84,14 @@ FIRST_OF_SEED_1 = [1559467604, 1612677339, 1664557657]
 
 def test_unknown_onsets_give_nothing_that_is_not_certain() -> None:
     chosen = choose_windows(0, 9_000 * MS, 3_000 * MS, None, WINDOW, 50, 0)
-    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, GROSS)] == [50, 0, 0]
+    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, samples.GROSS)] == [50, 0, 0]
     chosen = choose_windows(0, 9_000 * MS, None, None, WINDOW, 50, 0)
-    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, GROSS)] == [0, 0, 0]
+    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, samples.GROSS)] == [0, 0, 0]
 
 
 def test_the_centre_first_leaves_no_incipient_phase() -> None:
     chosen = choose_windows(0, 9_000 * MS, 3_000 * MS, 3_000 * MS, WINDOW, 50, 0)
-    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, GROSS)] == [50, 0, 50]
+    assert [len(chosen[label]) for label in (NO_SLIP, INCIPIENT, samples.GROSS)] == [50, 0, 50]
 
 
 @pytest.mark.parametrize(
@@ -121,14 +115,14 @@ def test_consecutive_windows() -> None:
 
 @given(st.integers(0, 2**62), st.integers(-5, 300), st.integers(1, 60), st.integers(1, 60))
 def test_strided_windows_are_all_that_fit(start: int, span: int, window: int, stride: int) -> None:
-    found = strided_windows(start, start + span, window, stride)
+    found = samples.strided_windows(start, start + span, window, stride)
     expected = [k for k in range(0, max(span, 0) + 1, stride) if k + window <= span]
     assert (found - start).tolist() == expected
-    same = strided_windows(start, start + span, window, window)
+    same = samples.strided_windows(start, start + span, window, window)
     assert same.tolist() == consecutive_windows(start, start + span, window).tolist()
 
 
 @pytest.mark.parametrize(("window", "stride"), [(0, 10), (10, 0), (10, -1)])
 def test_no_window_and_no_stride(window: int, stride: int) -> None:
     with pytest.raises(ValueError, match="must be positive"):
-        strided_windows(0, 90, window, stride)
+        samples.strided_windows(0, 90, window, stride)

@@ -10,12 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sliplab.analysis.windows.windows import (
-    bin_events,
-    first_pixel,
-    list_events,
-    window_totals,
-)
+from sliplab.analysis.windows.windows import bin_events, first_pixel, list_events, window_totals
 from sliplab.protocols.settings import Windows
 from sliplab.storage.streams import EventChunk
 
@@ -98,8 +93,7 @@ def test_counts_are_the_naive_histogram(
 
 
 @pytest.mark.parametrize(
-    ("t", "step"),
-    [(-1, None), (0, 0), (999, 0), (1000, 1), (29_999, 29), (30_000, None)],
+    ("t", "step"), [(-1, None), (0, 0), (999, 0), (1000, 1), (29_999, 29), (30_000, None)]
 )
 def test_a_window_is_half_open(t: int, step: int | None) -> None:
     for start in (0, 2**53, 2**62):
@@ -182,16 +176,16 @@ def test_read_only_and_strided_columns() -> None:
 def test_bad_columns_are_named() -> None:
     x, y, p, t = (np.array([300, 300]) for _ in range(4))
     start = np.array([0])
-    with pytest.raises(ValueError, match="event 0 at 5 us, then 4"):
-        bin_events(EventChunk(x, y, p, np.array([5, 4])), start, PAPER)
+    for columns, said in (
+        ((x, y, p, np.array([5, 4])), "event 0 at 5 us, then 4"),
+        ((x, np.array([480, 2]), p, t), "event 0 at pixel"),
+        ((np.array([-1, 2]), y, p, t), "not pixels"),
+        ((x[:1], y, p, t), "unequal length"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            bin_events(EventChunk(*columns), start, PAPER)
     with pytest.raises(ValueError, match=r"event 1 at pixel \(640, 300\): outside 640 x 480"):
         window_totals(EventChunk(np.array([300, 640]), y, p, t), start, PAPER)
-    with pytest.raises(ValueError, match="event 0 at pixel"):
-        bin_events(EventChunk(x, np.array([480, 2]), p, t), start, PAPER)
-    with pytest.raises(ValueError, match="not pixels"):
-        bin_events(EventChunk(np.array([-1, 2]), y, p, t), start, PAPER)
-    with pytest.raises(ValueError, match="unequal length"):
-        bin_events(EventChunk(x[:1], y, p, t), start, PAPER)
     with pytest.raises(ValueError, match="larger than the sensor"):
         bin_events(EventChunk(x, y, p, t), start, PAPER, 300, 300)
     for bad in (t.astype(float), t.reshape(2, 1)):
@@ -217,9 +211,8 @@ def test_events_are_counted_about_the_centre_that_is_told() -> None:
     columns = [np.array([v]) for v in (450, 250, 1, 0)]
     start = np.array([0])
     middle = bin_events(EventChunk(*columns), start, PAPER)
-    moved = bin_events(
-        EventChunk(*columns), start, PAPER, centre_px=(339.5, 259.5)
-    )  # 20 px right and down
+    # 20 px right and down
+    moved = bin_events(EventChunk(*columns), start, PAPER, centre_px=(339.5, 259.5))
     assert np.argwhere(middle[0, 0, 0]).tolist() == [[(250 - 40) // 20, (450 - 120) // 20]]
     assert np.argwhere(moved[0, 0, 0]).tolist() == [[(250 - 60) // 20, (450 - 140) // 20]]
 

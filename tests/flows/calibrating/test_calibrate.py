@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from datetime import date
@@ -38,13 +37,20 @@ TRUE_PLANE = taught_frame(load_rig_file(Path("mock"))[0])
 """The shipped file's plane, which is the true one to 0.01 mm."""
 
 
-def lab(folder: Path, *, moved_mm: float = 0.0, leant_mm: float = 0.0, mock: str = "") -> Path:
+def lab(
+    folder: Path,
+    *,
+    moved_mm: float = 0.0,
+    leant_mm: float = 0.0,
+    level: str = "tracks",
+    mock: str = "",
+) -> Path:
     """A rig file whose plane lies `moved_mm` too deep, and leans by `leant_mm` over 60 mm."""
     text = MOCK.replace("400.35 mm, 0", f"{400.35 + moved_mm:.3f} mm, 0")
     text = text.replace("400.17 mm, 60", f"{400.17 + moved_mm + leant_mm:.3f} mm, 60")
     text = text.replace("400.73 mm, 0", f"{400.73 + moved_mm:.3f} mm, 0")
     path = folder / "lab.yaml"
-    path.write_text(text + f"  frame_camera: {{level: tracks}}\n{mock}")
+    path.write_text(text + f"  frame_camera: {{level: {level}}}\n{mock}")
     return path
 
 
@@ -104,38 +110,24 @@ def test_a_plane_by_hand_is_found_too(tmp_path: Path) -> None:
     assert found.changes["calibration.contact_plane"]["method"] == "jogged by hand and confirmed"
 
 
-def by_hand(points: dict[str, tuple[float, float, float]]) -> Any:
-    """A person who jogs to places in the true plane's coordinates."""
-
-    def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
-        return [
-            TRUE_PLANE.pose(Position(*points[word.removeprefix("touched ")])) for _, word in prompts
-        ]
-
-    return jog_poses
-
-
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("right", "above", "check", "says"),
     [
-        (
-            {"centre": (0, 0, 0), "right": (12, 0, 0), "above": (-9, 0.5, 0), "check": (3, 3, 0)},
-            "almost on one line",
-        ),
-        (
-            {"centre": (0, 0, 0), "right": (2, 0, 0), "above": (0, 12, 0), "check": (3, 3, 0)},
-            "at least 5 mm",
-        ),
-        (
-            {"centre": (0, 0, 0), "right": (12, 0, 0), "above": (0, 12, 0), "check": (-9, -9, 0.3)},
-            r"fourth touch is \+0.300 mm off",
-        ),
+        ((12, 0, 0), (-9, 0.5, 0), (3, 3, 0), "almost on one line"),
+        ((2, 0, 0), (0, 12, 0), (3, 3, 0), "at least 5 mm"),
+        ((12, 0, 0), (0, 12, 0), (-9, -9, 0.3), r"fourth touch is \+0.300 mm off"),
     ],
 )
 def test_points_that_make_no_plane_write_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: Any, says: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, right: Any, above: Any, check: Any, says: str
 ) -> None:
-    monkeypatch.setattr(teach, "jog_poses", by_hand(points))
+    points = {"centre": (0, 0, 0), "right": right, "above": above, "check": check}
+
+    def jog_poses(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
+        places = (points[word.removeprefix("touched ")] for _, word in prompts)
+        return [TRUE_PLANE.pose(Position(*place)) for place in places]
+
+    monkeypatch.setattr(teach, "jog_poses", jog_poses)
     with pytest.raises(RigError, match=says):
         teach.teach_plane_by_hand(session(lab(tmp_path)))
 
@@ -159,8 +151,7 @@ def test_a_touch_depth_that_is_wrong_is_told_by_the_markers(tmp_path: Path) -> N
 
 
 def test_depth_zero_from_a_video(tmp_path: Path) -> None:
-    path = lab(tmp_path)
-    path.write_text(path.read_text().replace("level: tracks", "level: video"))
+    path = lab(tmp_path, level="video")
     found = teach.teach_zero(session(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
     assert abs(found.figures["by_markers_mm"][0]) < 0.08
 
@@ -183,9 +174,7 @@ def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> 
     assert np.allclose(found.figures["offset_mm"], [10.0, -5.0 + 0.5, 81.0], atol=0.1)
 
 
-def test_poses_that_are_all_alike_write_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_that_are_all_alike_write_nothing(tmp_path: Path) -> None:
     here = session(lab(tmp_path))
     here.rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
     with pytest.raises(RigError, match="too much alike"):
@@ -284,8 +273,7 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
     assert run("teach", "plane", "--rig", path, "--yes", "--json", "--repeats", 1) == 0
     said = capsys.readouterr()
     data = json.loads(said.out)
-    assert data["simulated"] is True
-    assert data["written"] == str(path)
+    assert (data["simulated"], data["written"]) == (True, str(path))
     assert Path(data["kept"]).read_text() == before
     assert data["moved_mm"] == pytest.approx(-1.0, abs=0.1)
     assert "simulated" in said.err
@@ -352,21 +340,30 @@ def test_a_dry_run_says_where_and_connects_to_nothing(
     assert data["dry_run"] is True
     assert len(data["moves"]) == {"plane": 4, "zero": 2, "tool": 0}[what]
     for move in data["moves"]:
-        assert move["to_mm"] == 2.0
-        x = TRUE_PLANE.position(move["base_mm"])
-        assert x.depth_mm == pytest.approx(2.0, abs=0.01)
+        depth_mm = TRUE_PLANE.position(move["base_mm"]).depth_mm
+        assert (move["to_mm"], depth_mm) == (2.0, pytest.approx(2.0, abs=0.01))
     assert run("teach", what, "--rig", "mock", "--dry-run") == 0
-    said = capsys.readouterr().out
-    assert "dry run" in said
+    assert "dry run" in capsys.readouterr().out
 
 
+STOPPED = "  faults: [{kind: arm_protective_stop, trial: %d, at_s: 2, since: trial}]\n"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"moved_mm": -6.0}, "found no plate within the hard limit"),
+        ({"mock": STOPPED % 2}, "unlock the stop at the pendant"),
+    ],
+    ids=["no plate", "protective stop"],
+)
 def test_a_failed_measurement_is_exit_1_and_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], says: str
 ) -> None:
-    path = lab(tmp_path, moved_mm=-6.0)
+    path = lab(tmp_path, **changes)
     before = path.read_text()
     assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
-    assert "found no plate within the hard limit" in capsys.readouterr().err
+    assert says in " ".join(capsys.readouterr().err.split())
     assert path.read_text() == before
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
 
@@ -391,18 +388,6 @@ def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
     (rig,) = rigs
     assert rig.arm.progress().done
     assert rig.position().depth_mm <= -2.9
-    assert path.read_text() == before
-
-
-def test_a_protective_stop_in_the_middle_says_what_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fault = "  faults: [{kind: arm_protective_stop, trial: 2, at_s: 2, since: trial}]\n"
-    path = lab(tmp_path, mock=fault)
-    before = path.read_text()
-    assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
-    said = " ".join(capsys.readouterr().err.split())
-    assert "unlock the stop at the pendant" in said
     assert path.read_text() == before
 
 
@@ -444,10 +429,6 @@ def test_the_commands_from_outside(tmp_path: Path) -> None:
     assert len(json.loads(done.stdout)["moves"]) == 4
 
 
-def check(rig: Path, store: Path) -> subprocess.CompletedProcess[str]:
-    return here("check", "protocols/pilot.yaml", "--rig", rig, "--store", store, "--json")
-
-
 def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
     path = lab(tmp_path)
     path.write_text(
@@ -455,7 +436,8 @@ def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
         .replace("taught: 2026-11-21", "taught: 2024-01-01")
         .replace("  touch_depth", "  max_age: {contact_plane: 30 d, lens: 90 d}\n  touch_depth")
     )
-    done = check(path, tmp_path / "s")
+    asked = ("--rig", path, "--store", tmp_path / "s", "--json")
+    done = here("check", "protocols/pilot.yaml", *asked)
     assert done.returncode == 1
     said = [c["finding"] for c in json.loads(done.stdout)["checks"] if not c["passed"]]
     assert len(said) == 2
@@ -466,12 +448,7 @@ def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
 
 def test_an_arm_that_is_stopped_stays_so(tmp_path: Path) -> None:
     """Nothing here unlocks anything."""
-    here = session(
-        lab(
-            tmp_path,
-            mock=("  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"),
-        )
-    )
+    here = session(lab(tmp_path, mock=STOPPED % 1))
     with pytest.raises(RigError, match="protective stop"):
         teach.teach_zero(here, QUICK, 1, False)
     assert here.rig.arm.state() is ArmState.PROTECTIVE_STOP

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -23,41 +21,31 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import SLIPLAB, answer, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
+from tests.flows.programs import environment, running
 
 pytestmark = pytest.mark.programs
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
-@contextlib.contextmanager
-def collecting(protocol: Path, store: Path, log: Path) -> Iterator[subprocess.Popen[str]]:
+def collecting(
+    protocol: Path, store: Path, log: Path
+) -> AbstractContextManager[subprocess.Popen[str]]:
     """`sliplab collect` in a process of its own."""
-    command = ["collect", protocol, "--rig", RIG, "--store", store, "--json"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    environment.pop("PREFECT_HOME", None)
-    with log.open("w") as messages:
-        process = subprocess.Popen(
-            [*SLIPLAB, *map(str, command)],
-            cwd=ROOT,
-            env=environment,
-            text=True,
-            start_new_session=True,
-            stdout=subprocess.DEVNULL,
-            stderr=messages,
-        )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait(timeout=60)
+    command = ("collect", protocol, "--rig", RIG, "--store", store, "--json")
+    return running([*SLIPLAB, *command], log)
+
+
+def slides(folder: Path, degrees: Iterable[int]) -> Path:
+    """The protocol of slides in these directions."""
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"] = [*degrees]
+    data["analysis"]["split"] = {"method": "ranked"}
+    return write(folder / "p.yaml", data)
 
 
 def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
-    data = tiny()
-    data["collection"]["factors"]["direction"]["values"] = [*range(0, 360, 2)]
-    data["analysis"]["split"] = {"method": "ranked"}
-    protocol = write(tmp_path / "p.yaml", data)
+    protocol = slides(tmp_path, range(0, 360, 2))
     store, log = tmp_path / "store", tmp_path / "messages"
     trials = store / "campaigns" / "tiny" / "trials"
     with collecting(protocol, store, log) as process:
@@ -92,11 +80,7 @@ def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
 
 
 def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None:
-    data = tiny()
-    data["collection"]["factors"]["direction"]["values"] = [0, 60, 120]
-    data["analysis"]["split"] = {"method": "ranked"}
-    protocol = write(tmp_path / "p.yaml", data)
-    store = tmp_path / "store"
+    protocol, store = slides(tmp_path, (0, 60, 120)), tmp_path / "store"
     collect = ("collect", protocol, "--rig", RIG, "--store", store)
     assert here("pause", store).returncode == 2  # no store yet
     one = answer(*collect, "--trials", 1)
@@ -118,9 +102,8 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     rest = here(*collect)
     assert rest.returncode == 1  # not every trial was taken
     words = "".join(rest.stdout.split())
-    assert "1excludedtrial(" in words
-    assert "anna" in words
-    assert "cableintheway" in words
+    for said in ("1excludedtrial(", "anna", "cableintheway"):
+        assert said in words
     listed = answer("trials", store)
     assert listed["count"] == 2
     (aside,) = listed["set_aside"]
@@ -134,10 +117,7 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
 
 
 def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
-    data = tiny()
-    data["collection"]["factors"]["direction"]["values"] = [*range(0, 360, 2)]
-    data["analysis"]["split"] = {"method": "ranked"}
-    protocol, store = write(tmp_path / "p.yaml", data), tmp_path / "store"
+    protocol, store = slides(tmp_path, range(0, 360, 2)), tmp_path / "store"
     trials = store / "campaigns" / "tiny" / "trials"
     with collecting(protocol, store, tmp_path / "messages") as process:
         wait_for(lambda: trials.is_dir() and any(trials.iterdir()), process)
@@ -172,17 +152,14 @@ with exclusive(Path(sys.argv[1]), "the store"):
 def test_stop_signals_nothing_but_a_collection(script: str, tmp_path: Path) -> None:
     """Neither whom a stale lock names, nor who holds the lock for something else."""
     store = Store.create(tmp_path / "s")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         [sys.executable, "-c", script, store.folder / ".lock"],
         cwd=ROOT,
-        env=environment,
+        env=environment(),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    assert process.stdin is not None
     try:
         assert process.stdout.readline()
         if script == SLEEPER:

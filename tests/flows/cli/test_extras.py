@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from sliplab.flows.running.extras import EXTRAS, lacking
 from tests.command_line import MANY
 from tests.conftest import ROOT
 from tests.flows.older import older_store
+from tests.flows.programs import ended
 
 BLOCKED = """
 import sys
@@ -51,14 +51,7 @@ for ask in (store.label, store.train, lambda: sliplab.load_model(store.models()[
 def run(code: str, extras: tuple[str, ...], *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run Python without what these extras bring."""
     missing = ",".join(module for extra in extras for module in EXTRAS[extra])
-    return subprocess.run(
-        [sys.executable, "-c", code, missing, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ},
-        timeout=300,
-    )
+    return ended([sys.executable, "-c", code, missing, *arguments], 300)
 
 
 @pytest.fixture(scope="module")

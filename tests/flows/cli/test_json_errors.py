@@ -22,78 +22,52 @@ from tests.command_line import SECRET, here
 from tests.conftest import ROOT
 
 KEYS = ["file", "key", "value", "message", "exit_code"]
-NOWHERE = "nowhere"
-
-WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
-    # command: arguments, and the file, key and value that its error names; ROOM is a folder
-    "plan": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
-    "check": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
-    "register": (("ROOM/nowhere", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
-    "collect": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
-    **dict.fromkeys(
-        (
-            "sync",
-            "label",
-            "train",
-            "evaluate",
-            "report",
-            "generalise",
-            "trials",
-            "holdout",
-            "verify",
-            "migrate",
-            "pause",
-            "resume",
-            "stop",
-            "review",
-        ),
-        (("ROOM/nowhere",), "ROOM/nowhere", None, None),
-    ),
-    "reflex": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
-    "tradeoff": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
-    "guesses": (("ROOM/nowhere",), None, "COMMAND", "guesses"),
-    "study": (("ROOM/nowhere", "--status"), None, "FOLDER", "ROOM/nowhere"),
-    "demo": (("ROOM/file",), "ROOM/file", None, None),
-    "push": (("ROOM/nowhere", "file://ROOM/u"), "ROOM/nowhere", None, None),
-    "pull": (("file://ROOM/nowhere", "ROOM/p"), "file://ROOM/nowhere", None, None),
-    "rigs": (("--sped",), None, "--sped", None),
-    "skip": (("ROOM/nowhere", "x", "--why", "torn"), "ROOM/nowhere", None, None),
-    "again": (("ROOM/nowhere", "x", "--why", " "), None, "--why", ""),
-    "serve": (("--store", "ROOM/file", "--rig", "mock"), "ROOM/file", None, None),
-    "import": (("ROOM/nowhere", "--store", "ROOM/i", "--name", "n"), "ROOM/nowhere", None, None),
-    "export": (("ROOM/nowhere", "x", "--output", "ROOM/o"), "ROOM/nowhere", None, None),
-    "publish": (
-        ("ROOM/nowhere", "--as", "croissant", "--output", "ROOM/o"),
-        "ROOM/nowhere",
-        None,
-        None,
-    ),
-    "view": (("ROOM/nowhere", "x"), "ROOM/nowhere", None, None),
-    "detect": (("--rig", "mock", "--model", "ROOM/nowhere"), "ROOM/nowhere", None, None),
-    "export-model": (("ROOM/nowhere", "--out", "ROOM/e"), "ROOM/nowhere", None, None),
-    "power": (("pilot", "--store", "ROOM/nowhere"), "ROOM/nowhere", None, None),
-    "stress": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
-    "bench": (("nobody", "--folder", "ROOM/b"), None, "DETECTOR", "nobody"),
-    "schema": (("robot",), None, "KIND", "robot"),
-    "new driver": (("Lab-Arm", "--into", "ROOM"), None, "NAME", "Lab-Arm"),
-    **dict.fromkeys(
-        ("teach plane", "teach zero", "teach tool", "calibrate lens", "calibrate crop"),
-        (("--rig", "ROOM/nowhere"), "ROOM/nowhere", None, None),
-    ),
-    "calibrate scene": (
-        ("ROOM/nowhere", "--rig", "mock", "--out", "ROOM/t.yaml"),
-        "ROOM/nowhere",
-        None,
-        None,
-    ),
-    "calibrate drift": (("ROOM/nowhere", "--rig", "mock"), "ROOM/nowhere", None, None),
-    "calibrate gap": (
-        ("ROOM/nowhere", "--rig", "t.yaml", "--protocol", "pilot", "--out", "ROOM/g"),
-        "ROOM/nowhere",
-        None,
-        None,
-    ),
-    "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
+GONE = "ROOM/nowhere"
+"""A file that is not there; ROOM is a folder."""
+ALONE = (
+    *("plan", "sync", "label", "train", "evaluate", "report", "generalise", "trials"),
+    *("holdout", "verify", "migrate", "pause", "resume", "stop", "review", "reflex", "stress"),
+    "tradeoff",
+)
+WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
+    # command: arguments, and the file, key and value that its error names
+    **dict.fromkeys(ALONE, (GONE, GONE, None, None)),
+    **{
+        name: (words, GONE, None, None)
+        for name, words in {
+            "check": f"{GONE} --rig mock --store ROOM/s",
+            "register": f"{GONE} --store ROOM/s",
+            "collect": f"{GONE} --rig mock --store ROOM/s",
+            "push": f"{GONE} file://ROOM/u",
+            "skip": f"{GONE} x --why torn",
+            "import": f"{GONE} --store ROOM/i --name n",
+            "export": f"{GONE} x --output ROOM/o",
+            "publish": f"{GONE} --as croissant --output ROOM/o",
+            "view": f"{GONE} x",
+            "detect": f"--rig mock --model {GONE}",
+            "export-model": f"{GONE} --out ROOM/e",
+            "power": f"pilot --store {GONE}",
+            "teach plane": f"--rig {GONE}",
+            "teach zero": f"--rig {GONE}",
+            "teach tool": f"--rig {GONE}",
+            "calibrate lens": f"--rig {GONE}",
+            "calibrate crop": f"--rig {GONE}",
+            "calibrate scene": f"{GONE} --rig mock --out ROOM/t.yaml",
+            "calibrate drift": f"{GONE} --rig mock",
+            "calibrate gap": f"{GONE} --rig t.yaml --protocol pilot --out ROOM/g",
+        }.items()
+    },
+    "pull": (f"file://{GONE} ROOM/p", f"file://{GONE}", None, None),
+    "demo": ("ROOM/file", "ROOM/file", None, None),
+    "serve": ("--store ROOM/file --rig mock", "ROOM/file", None, None),
+    "study": (f"{GONE} --status", None, "FOLDER", GONE),
+    "guesses": (GONE, None, "COMMAND", "guesses"),
+    "rigs": ("--sped", None, "--sped", None),
+    "again": (f"{GONE}|x|--why| ", None, "--why", ""),
+    "bench": ("nobody --folder ROOM/b", None, "DETECTOR", "nobody"),
+    "schema": ("robot", None, "KIND", "robot"),
+    "new driver": ("Lab-Arm --into ROOM", None, "NAME", "Lab-Arm"),
+    "calibrate board": ("--out ROOM/x.doc", None, "--out", "ROOM/x.doc"),
 }
 
 
@@ -137,7 +111,8 @@ def test_wrong_input_is_one_object_and_exit_2(name: str, tmp_path: Path) -> None
     def placed(text: str | None) -> str | None:
         return None if text is None else text.replace("ROOM", str(tmp_path))
 
-    error = error_of(*name.split(), *map(placed, words))
+    arguments = words.split("|") if "|" in words else words.split()
+    error = error_of(*name.split(), *map(placed, arguments))
     assert error["exit_code"] == 2
     assert [error["file"], error["key"], error["value"]] == [placed(text) for text in named]
     assert error["message"]
@@ -168,12 +143,8 @@ def test_options_and_arguments_are_named(
     words: tuple[str, ...], key: str | None, value: str | None
 ) -> None:
     error = error_of(*words)
-    assert (error["exit_code"], error["file"], error["key"], error["value"]) == (
-        2,
-        None,
-        key,
-        value,
-    )
+    found = tuple(error[name] for name in ("exit_code", "file", "key", "value"))
+    assert found == (2, None, key, value)
 
 
 @pytest.mark.parametrize("place", ["ROOM", "ROOM/file", "file://ROOM/nowhere"])
@@ -260,24 +231,14 @@ def test_an_arm_that_does_not_stop_is_said_to_whoever_pressed_ctrl_c(
     assert "press its emergency stop" in json.loads(done.stdout)["error"]["message"]
 
 
-@pytest.mark.parametrize(
-    ("command", "of_trials"),
-    [
-        ("plan", False),
-        ("register", False),
-        ("power", False),
-        ("verify", False),
-        ("collect", True),
-        ("label", True),
-    ],
-)
+@pytest.mark.parametrize("command", ["plan", "register", "power", "verify", "collect", "label"])
 def test_interrupted_command_names_trials_only_where_it_resumes_them(
-    command: str, of_trials: bool, monkeypatch: pytest.MonkeyPatch
+    command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.argv", ["sliplab", command, "x", "--json"])
     found = errors.interruption().message
     assert found.startswith("interrupted: ")
-    assert ("trial" in found) == of_trials
+    assert ("trial" in found) == (command in {"collect", "label"})
     assert "run the same command" in found
 
 

@@ -21,6 +21,7 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.flows.programs import ended
 
 PLAN = (ROOT / "protocols" / "pilot.yaml",)
 
@@ -45,13 +46,7 @@ main()
     ],
 )
 def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", STARTED, which, str(limit), "plan", *PLAN, "--json"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    done = ended([sys.executable, "-c", STARTED, which, limit, "plan", *PLAN, "--json"])
     error = json.loads(done.stdout)["error"]
     assert (done.returncode, error["exit_code"]) == (1, 1)
     assert error["message"].startswith(message)
@@ -181,13 +176,7 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
     how: str, said: str, tmp_path: Path
 ) -> None:
     """HDF5 crashed it at its exit: collect ended with a segmentation fault, not with exit 1."""
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, tmp_path / "data.h5", how],
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        timeout=120,
-    )
+    done = ended([sys.executable, "-c", FULL, tmp_path / "data.h5", how])
     assert (done.returncode, done.stdout) == (0, f"{said}\n"), done.stderr
 
 
@@ -238,7 +227,6 @@ def test_a_library_that_crashes_for_want_of_memory_ends_in_one_line() -> None:
 
 def test_a_program_with_limited_memory_can_be_stopped() -> None:
     with limited("wait") as process:
-        assert process.stdout is not None
         child = int(process.stdout.readline())
         assert child != process.pid
         process.send_signal(signal.SIGINT)
@@ -247,7 +235,6 @@ def test_a_program_with_limited_memory_can_be_stopped() -> None:
 
 def test_a_child_ends_with_its_killed_parent() -> None:
     with limited("wait") as process:
-        assert process.stdout is not None
         watched = os.pidfd_open(int(process.stdout.readline()))
         try:
             process.kill()
@@ -271,7 +258,6 @@ def test_threads_that_cannot_be_started_are_said_before_a_library_asks_for_them(
     monkeypatch.setattr(threading.Thread, "start", refuse_the_second)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     said = too_few_threads()
-    assert said is not None
     assert said.startswith("no more processes or threads can be started")
     (thread,) = begun
     assert not thread.is_alive()

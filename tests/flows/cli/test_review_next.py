@@ -18,10 +18,16 @@ from tests.analysis.review.evaluated import Evaluated
 from tests.command_line import here
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    """A campaign without doubts."""
+    return Evaluated(tmp_path_factory.mktemp("next") / "s")
+
+
 @pytest.fixture
-def made(tmp_path: Path) -> Evaluated:
+def made(whole: Evaluated, tmp_path: Path) -> Evaluated:
     """An evaluated campaign with three labels in doubt; one of these is decided."""
-    made = Evaluated(tmp_path / "s")
+    made = whole.copied(tmp_path / "s")
     for trial, ms in zip(made.tests, (30.0, 60.0, 50.0), strict=False):
         made.widen(trial, ms)
     made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
@@ -37,16 +43,8 @@ def test_the_order_as_an_object_and_as_a_table(made: Evaluated) -> None:
     assert list(found) == ["trials", "to_decide", "simulated", "in_doubt", "next", "gains", "notes"]
     assert (found["simulated"], found["in_doubt"], found["to_decide"]) == (True, 2, 109)
     (first,) = found["next"]
-    assert list(first) == [
-        "campaign",
-        "trial",
-        "split",
-        "spread_ms",
-        "unusable",
-        "score",
-        "moves",
-        "reasons",
-    ]
+    about = ["campaign", "trial", "split", "spread_ms", "unusable", "score", "moves", "reasons"]
+    assert list(first) == about
     assert first["spread_ms"] == {"incipient": 60.0, "gross": 0.0}
     assert first["score"] == first["moves"][0]["of_interval"] > 0
     assert found["gains"][0]["left"] < found["gains"][0]["label_width"]
@@ -58,8 +56,8 @@ def test_the_order_as_an_object_and_as_a_table(made: Evaluated) -> None:
     assert "1 decisions that there are" in done.stderr
 
 
-def test_without_doubts_it_says_so(tmp_path: Path) -> None:
-    made = Evaluated(tmp_path / "s")
+def test_without_doubts_it_says_so(whole: Evaluated, tmp_path: Path) -> None:
+    made = whole.copied(tmp_path / "s")
     made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
     done = here("review", made.store.folder, "--next", "--no-page")
     assert done.returncode == 0, done.stderr

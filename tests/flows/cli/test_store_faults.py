@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,19 @@ def sliplab(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) 
     return run
 
 
-@pytest.fixture
-def whole(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a protocol, a rig file, and a store with two trials."""
-    work, _ = session(tmp_path, slides(2), frame_camera=TRACKS)
+    folder = tmp_path_factory.mktemp("taken") / "lab"
+    work, _ = session(folder, slides(2), frame_camera=TRACKS)
     take_all(work)
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def whole(taken: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be damaged at will."""
+    return shutil.copytree(taken, tmp_path / "lab")
 
 
 def trials(folder: Path) -> list[Path]:
@@ -65,13 +73,11 @@ def test_figures_add_up_after_damage(whole: Path, sliplab: Sliplab) -> None:
         trials(whole)[0].name
     ]
     code, found, _ = sliplab("verify", whole / "store", "--json")
-    assert found is not None
     assert code == 1
     assert (found["trials"], found["whole"], found["damaged"]) == (2, 1, 1)
     assert (found["format"], found["ok"], found["quarantined"]) == (FORMAT, False, [])
     assert [item["trial"] for item in found["problems"]] == [trials(whole)[0].name]
     code, table, said = sliplab("trials", whole / "store", "--json")
-    assert table is not None
     assert (code, table["count"], len(table["unreadable"])) == (0, 1, 1)
     assert "left out: " in said
 
@@ -80,14 +86,12 @@ def test_a_damaged_trial_is_set_aside_and_taken_again(whole: Path, sliplab: Slip
     sums = {path.name: read_json(path / "checksums.json") for path in trials(whole)}
     flip(trials(whole)[0] / "data.h5")
     code, found, _ = sliplab("verify", whole / "store", "--quarantine", "--json")
-    assert found is not None
     assert (code, found["quarantined"]) == (1, [min(sums)])
     work, campaign = session(whole, slides(2), frame_camera=TRACKS)
     take_all(work)
     assert {path.name: read_json(path / "checksums.json") for path in trials(whole)} == sums
     assert campaign.quarantined()[0]["cause"].startswith("damaged: data.h5: does not match")
     code, found, _ = sliplab("verify", whole / "store", "--json")
-    assert found is not None
     assert (code, found["whole"], found["damaged"], found["ok"]) == (0, 2, 0, True)
 
 
@@ -105,7 +109,6 @@ def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path, sliplab: 
             assert code == 1
             assert "is in use by another program" in " ".join(said.split())
         code, found, _ = sliplab("verify", whole / "store", "--json")  # readers need no lock
-        assert found is not None
         assert (code, found["damaged"]) == (1, 1)
     assert len(trials(whole)) == 2
 
@@ -117,14 +120,12 @@ def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(
         write_json(whole / "store" / "store.json", {"format": 1})
         if by_hand:
             code, found, _ = sliplab("migrate", whole / "store", "--json")
-            assert found is not None
             assert (code, found["format"], found["from"]) == (0, FORMAT, [1])
             assert Path(found["copies"][0], "store.json").is_file()
         else:
             with open_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
                 assert Store.open(whole / "store").format == FORMAT
     code, found, _ = sliplab("migrate", whole / "store", "--json")
-    assert found is not None
     assert (code, found["from"]) == (0, [])
 
 

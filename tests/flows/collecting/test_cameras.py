@@ -33,7 +33,7 @@ WORDS = {"events": "event camera", "frames": "frame camera"}
 OTHER = {"events": "frames", "frames": "events"}
 
 
-def take(camera: str, folder: Path, **recording: object) -> Recording:
+def take(camera: str, folder: Path, **recording: object) -> None:
     """One short trial of the pilot on the simulated rig that has only this camera."""
     protocol = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
     protocol["collection"]["motion"][3]["distance"] = "2 mm"
@@ -42,13 +42,26 @@ def take(camera: str, folder: Path, **recording: object) -> Recording:
     path = write_yaml(folder / "pilot.yaml", protocol)
     request = make_request(path, ROOT / "rigs" / f"mock_{camera}.yaml", folder / "store", most=1)
     assert collect(request)["taken"] == 1
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders with the trial of each camera; nothing here changes them."""
+    folders = {camera: tmp_path_factory.mktemp(camera) for camera in WORDS}
+    for camera, folder in folders.items():
+        take(camera, folder)
+    return folders
+
+
+def only(folder: Path) -> Recording:
+    """The trial in a folder's store."""
     campaign = Store.open(folder / "store").campaign("pilot")
     return campaign.recording(*campaign.committed())
 
 
 @pytest.mark.parametrize("camera", ["events", "frames"])
-def test_one_camera_is_enough_to_collect(camera: str, tmp_path: Path) -> None:
-    found = take(camera, tmp_path)
+def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) -> None:
+    found = only(taken[camera])
     record, other = found.record, OTHER[camera]
     counts = record.counts.model_dump()
     assert counts[camera] > 500
@@ -63,18 +76,19 @@ def test_one_camera_is_enough_to_collect(camera: str, tmp_path: Path) -> None:
     assert ("frames_lost" in gates) == (camera == "frames")
     # its clock is right: the arm's poses say when the slide began, and the truth agrees
     assert found.step("slide")[1] > found.step("slide")[0]
-    assert verify(Store.open(tmp_path / "store")) == []
+    store = Store.open(taken[camera] / "store")
+    assert verify(store) == []
+    with pytest.raises(StoreError, match="has no label yet"):
+        train(store, collected(store))
 
 
-def test_the_camera_that_is_there_sees_what_it_saw_beside_the_other(tmp_path: Path) -> None:
-    both = ROOT / "rigs" / "mock.yaml"
-    one = take("events", tmp_path / "one")
-    request = make_request(
-        tmp_path / "one" / "pilot.yaml", both, tmp_path / "both" / "store", most=1
-    )
-    collect(request)
-    campaign = Store.open(tmp_path / "both" / "store").campaign("pilot")
-    other = campaign.recording(one.trial_id)
+def test_the_camera_that_is_there_sees_what_it_saw_beside_the_other(
+    taken: dict[str, Path], tmp_path: Path
+) -> None:
+    one, both = only(taken["events"]), ROOT / "rigs" / "mock.yaml"
+    collect(make_request(taken["events"] / "pilot.yaml", both, tmp_path / "store", most=1))
+    other = only(tmp_path)
+    assert other.trial_id == one.trial_id
     with one.open() as a, other.open() as b:
         assert np.array_equal(a.events().t_us, b.events().t_us)
         assert np.array_equal(a.column("poses/xyz"), b.column("poses/xyz"))
@@ -109,11 +123,3 @@ def test_cameras_are_events_or_frames_or_both(cameras: list[str], tmp_path: Path
     with pytest.raises(InputError) as caught:
         load_rig_file(path)
     assert caught.value.key.startswith("cameras")
-
-
-@pytest.mark.parametrize("camera", ["events", "frames"])
-def test_training_says_what_it_lacks(camera: str, tmp_path: Path) -> None:
-    take(camera, tmp_path)
-    store = Store.open(tmp_path / "store")
-    with pytest.raises(StoreError, match="has no label yet"):
-        train(store, collected(store))

@@ -35,9 +35,10 @@ from sliplab.storage.streams import NullSink, WrenchChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
+from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import session, short, take_all
 from tests.flows.conftest import tiny, tiny_gravity
 from tests.flows.ui.test_view import Read
@@ -46,30 +47,52 @@ TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_u
 TRACKS = {"level": "tracks"}
 
 
+def felt(
+    folder: Path, data: dict[str, Any], force: dict[str, Any] | None = None, **mock: Any
+) -> tuple[TrialCollector, Campaign]:
+    """A session on a rig with a force sensor."""
+    return session(folder / "a", data, TIMING, force=force or {}, frame_camera=TRACKS, **mock)
+
+
+def gated(**gates: Any) -> dict[str, Any]:
+    """A slide with these gates in place of the protocol's."""
+    data = slides(1)
+    data["collection"]["gates"] = gates
+    return data
+
+
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """One slide to 0 degrees, with forces."""
+    """One slide to 0 degrees, with forces that hold their gates."""
     folder = tmp_path_factory.mktemp("force")
-    work, campaign = session(folder / "a", short(), TIMING, force={}, frame_camera=TRACKS)
+    work, campaign = felt(folder, gated(normal_force="5 N", hold_force="1 N"))
     take_all(work)
     assert verify(Store.open(folder / "a" / "store")) == []
-    return sorted(campaign.recordings(), key=lambda r: str(r.record.condition["direction"]))[0]
+    (recording,) = campaign.recordings()
+    return recording
+
+
+@pytest.fixture(scope="module")
+def unfelt(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """The same of a rig without a sensor."""
+    folder = tmp_path_factory.mktemp("unfelt")
+    work, campaign = session(folder / "a", slides(1), frame_camera=TRACKS)
+    take_all(work)
+    return campaign
 
 
 def test_the_record_counts_and_times_the_forces(taken: Recording) -> None:
     record = taken.record
     stream = record.streams["force"]
-    assert stream.kind == "wrench"
-    assert stream.rows == len(taken.wrenches())
+    assert (stream.kind, stream.rows) == ("wrench", len(taken.wrenches()))
     assert stream.rows == pytest.approx(record.recorded_s * 1000, rel=0.2)
     assert stream.to_plate == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     clock = record.clocks.streams["force"]
     assert (clock.grade, clock.kind) == ("host time", "hard bound")
     gate = record.quality.gates["sync_uncertainty_force_s"]
-    assert gate.passed
-    assert gate.grade == "host time"
+    assert (gate.passed, gate.grade) == (True, "host time")
+    assert all(record.quality.gates[name].passed for name in ("normal_force_n", "hold_force_n"))
     assert 0.001 < float(gate.value or 0) < 0.004
-    assert record.timing is not None
     assert record.timing.rig.force is not None
     truth = np.array((record.simulation_truth or {})["clocks"]["force"])
     error = np.abs(np.asarray(clock.map.to_reference(truth[:, 0])) - truth[:, 1])
@@ -90,6 +113,9 @@ def test_forces_stand_on_the_plate_and_on_the_time_line(taken: Recording) -> Non
     assert slid.tangential_n[-50:].mean() > 0.5
     assert np.all(slid.tangential_n < 1.1 * slid.normal_n)
     assert 1e6 < found.uncertainty_ns < 4e6
+    read = open_store(taken.folder.parents[3]).trial(taken.trial_id).forces()
+    assert np.array_equal(read.t_ns, found.t_ns)
+    assert read.normal_n.mean() > 0.5
 
 
 def test_figures_of_the_forces_are_in_record_and_catalogue(taken: Recording) -> None:
@@ -105,36 +131,18 @@ def test_figures_of_the_forces_are_in_record_and_catalogue(taken: Recording) -> 
 
 @pytest.mark.parametrize(
     ("gate", "said"),
-    [
-        ({"normal_force": "0.5 N"}, "normal_force_n = "),
-        ({"hold_force": "4 N"}, "hold_force_n = "),
-    ],
+    [({"normal_force": "0.5 N"}, "normal_force_n = "), ({"hold_force": "4 N"}, "hold_force_n = ")],
 )
 def test_gates_of_force_reject_a_trial(gate: dict[str, str], said: str, tmp_path: Path) -> None:
-    data = short()
-    data["collection"]["gates"] = {"retakes": 0, **gate}
-    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    work, campaign = felt(tmp_path, gated(retakes=0, **gate))
     take_all(work)
     assert campaign.committed() == set()
     assert all(said in failed["cause"] for failed in campaign.quarantined())
 
 
-def test_gates_that_hold_leave_the_trials(tmp_path: Path) -> None:
-    data = short()
-    data["collection"]["gates"] = {"normal_force": "5 N", "hold_force": "1 N"}
-    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
-    take_all(work)
-    assert len(campaign.committed()) == 3
-    gates = next(iter(campaign.recordings())).record.quality.gates
-    assert gates["normal_force_n"].passed
-    assert gates["hold_force_n"].passed
-
-
 def test_a_gate_of_force_needs_a_sensor(tmp_path: Path) -> None:
-    data = short()
-    data["collection"]["gates"] = {"normal_force": "5 N"}
     with pytest.raises(InputError, match=r"gates.normal_force = 5 N: needs a force sensor"):
-        session(tmp_path / "a", data, frame_camera=TRACKS)
+        session(tmp_path / "a", gated(normal_force="5 N"), frame_camera=TRACKS)
 
 
 @pytest.mark.parametrize("per_m", [0.0, -30.0])
@@ -144,17 +152,9 @@ def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path:
     condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
     data["collection"]["references"] = {"every": 1, "condition": condition}
     data["collection"]["gates"]["reference"] = {"event_rate": "90 %", "friction": "10 %"}
-    work, campaign = session(
-        tmp_path / "a",
-        data,
-        TIMING,
-        force={},
-        frame_camera=TRACKS,
-        faults=[{"kind": "skin_wear", "per_m": per_m}],
-    )
-    run_request = make_request(
-        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
-    )
+    work, campaign = felt(tmp_path, data, faults=[{"kind": "skin_wear", "per_m": per_m}])
+    protocol, rig, folder = (tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store"))
+    run_request = make_request(protocol, rig, folder)
     store = Store.open(run_request.store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
     if per_m == 0.0:
@@ -188,43 +188,32 @@ def test_a_gate_of_friction_needs_forces_and_a_slide(tmp_path: Path) -> None:
         validate(Protocol, falls, "p.yaml")
 
 
-def test_forces_are_read_by_the_public_interface(taken: Recording) -> None:
-    trial = open_store(taken.folder.parents[3]).trial(taken.trial_id)
-    found = trial.forces()
-    assert np.array_equal(found.t_ns, plate_forces(taken).t_ns)
-    assert found.normal_n.mean() > 0.5
-
-
-def test_a_rig_without_a_sensor_says_nothing_of_forces(tmp_path: Path) -> None:
-    work, campaign = session(tmp_path / "a", short(), frame_camera=TRACKS)
-    take_all(work)
-    recording = next(iter(campaign.recordings()))
+def test_a_rig_without_a_sensor_says_nothing_of_forces(unfelt: Campaign) -> None:
+    recording = next(iter(unfelt.recordings()))
     text = (recording.folder / "record.json").read_text()
     data = json.loads(text)
     assert "streams" not in data
     assert "streams" not in data["clocks"]
-    assert "force" not in data["timing"]["rig"]
     assert "force" not in text
     assert not has_forces(recording)
     with pytest.raises(StoreError, match="no wrenches 'force'"):
         plate_forces(recording)
+    store = Store.open(unfelt.folder.parents[1])
+    assert force_section(store, [Collected(unfelt)], None, simulated=True) is None
+    label, _ = label_results(recording, Labelling())
+    assert "force" not in label.to_json()
+    ruled, _ = label_results(recording, Labelling(rule="force"))
+    assert ruled.incipient_ns is None
+    assert ruled.doubts.incipient == "the trial has no forces of a slide"
 
 
 def test_a_clock_that_jumps_back_is_refused_and_the_trial_taken_again(tmp_path: Path) -> None:
-    fault = {
-        "kind": "clock_jump",
-        "device": "force_sensor",
-        "seconds": -2.0,
-        "at_s": 0.5,
-        "trial": 2,
-    }
-    work, campaign = session(
-        tmp_path / "a", short(), TIMING, force={}, frame_camera=TRACKS, faults=[fault]
-    )
+    jump = {"kind": "clock_jump", "device": "force_sensor", "seconds": -2.0}
+    work, campaign = felt(tmp_path, slides(1), faults=[{**jump, "at_s": 0.5, "trial": 1}])
     take_all(work)
     (failed,) = campaign.quarantined()
     assert "sync_uncertainty_force_s: its clock fell back" in failed["cause"]
-    assert len(campaign.committed()) == 3
+    assert len(campaign.committed()) == 1
 
 
 def test_figures_are_of_the_right_stretches() -> None:
@@ -261,7 +250,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
     data = tiny()
     data["collection"]["factors"]["direction"]["values"] = [0, 120]
     data["analysis"]["split"] = {"method": "ranked"}
-    work, campaign = session(folder / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    work, campaign = felt(folder, data)
     take_all(work)
     store = Store.open(folder / "a" / "store")
     settings = work.plan.protocol.analysis.labelling
@@ -280,8 +269,6 @@ def test_the_label_has_onsets_by_force(labelled: Store) -> None:
         truth = recording.simulation_truth() or {}
         assert label.rule == "paper"
         force = label.by_rule("force")
-        assert force.incipient_ns is not None
-        assert force.gross_ns is not None
         assert abs(force.incipient_ns - truth["incipient_ns"]) < 30_000_000
         assert force.incipient_ns < force.gross_ns < truth["gross_ns"]
 
@@ -291,18 +278,13 @@ def test_the_force_may_rule(labelled: Store) -> None:
     recording = item.trials[0][1]
     settings = item.settings.labelling.model_copy(update={"rule": "force"})
     label, _ = label_results(recording, settings)
-    assert label.force is not None
-    assert (label.incipient_ns, label.gross_ns) == (
-        label.force.incipient_ns,
-        label.force.gross_ns,
-    )
+    assert (label.incipient_ns, label.gross_ns) == (label.force.incipient_ns, label.force.gross_ns)
     assert set(label.per_marker_ns) == {-1}
 
 
 def test_the_report_shows_the_forces(labelled: Store) -> None:
     items = [Collected(campaign) for campaign in labelled.campaigns()]
     section = force_section(labelled, items, None, simulated=True)
-    assert section is not None
     assert section.trials == 2
     assert 0.5 < section.friction < 1.0
     page = render_page("report.html", [section], simulated=True, campaigns=["tiny"], headline=[])
@@ -314,18 +296,6 @@ def test_the_report_shows_the_forces(labelled: Store) -> None:
     assert len(section.figures.rows) == 4
 
 
-def test_a_report_without_forces_has_no_such_section(tmp_path: Path) -> None:
-    work, campaign = session(tmp_path / "a", short(), frame_camera=TRACKS)
-    take_all(work)
-    store = Store.open(tmp_path / "a" / "store")
-    assert force_section(store, [Collected(campaign)], None, simulated=True) is None
-    label, _ = label_results(next(iter(campaign.recordings())), Labelling())
-    assert "force" not in label.to_json()
-    ruled, _ = label_results(next(iter(campaign.recordings())), Labelling(rule="force"))
-    assert ruled.incipient_ns is None
-    assert ruled.doubts.incipient == "the trial has no forces of a slide"
-
-
 # -- presses to a force --------------------------------------------------------------------
 
 
@@ -335,19 +305,13 @@ def to_force(**press: Any) -> dict[str, Any]:
     factors = data["collection"]["factors"]
     factors["load"] = {**factors.pop("depth"), "values": [1.0, 2.0], "unit": "N"}
     factors["direction"]["values"] = [0]
-    data["collection"]["motion"][1] = {
-        "phase": "press",
-        "force": "$load",
-        "speed": "1 mm/s",
-        **press,
-    }
+    data["collection"]["motion"][1] = {"phase": "press", "force": "$load", "speed": "1 mm/s"}
+    data["collection"]["motion"][1] |= press
     return data
 
 
 def test_a_plan_presses_to_a_force_in_place_of_a_depth(tmp_path: Path) -> None:
-    work, campaign = session(
-        tmp_path / "a", to_force(), TIMING, force={"noise_n": 0.002}, frame_camera=TRACKS
-    )
+    work, campaign = felt(tmp_path, to_force(), {"noise_n": 0.002})
     take_all(work)
     assert campaign.quarantined() == []
     depths = {}
@@ -383,7 +347,7 @@ class Watch(NullSink):
 
 def test_a_watched_trial_presses_to_its_force_and_stays_as_deep(tmp_path: Path) -> None:
     """Live detection runs a program without a recording; the rule of a press is the same."""
-    work, _ = session(tmp_path / "a", to_force(), TIMING, force={}, frame_camera=TRACKS)
+    work, _ = felt(tmp_path, to_force())
     rig, trial = work.rig, work.plan.trials[0]
     level = float(work.plan.describe(trial)["load"].split()[0])
     sent: list[float] = []
@@ -412,8 +376,7 @@ def depth_of_poses(work: TrialCollector, recording: Recording) -> np.ndarray:
 
 
 def test_a_press_that_meets_its_deepest_place_first_is_an_error(tmp_path: Path) -> None:
-    data = to_force(depth="1.2 mm")
-    work, campaign = session(tmp_path / "a", data, TIMING, force={}, frame_camera=TRACKS)
+    work, campaign = felt(tmp_path, to_force(depth="1.2 mm"))
     with pytest.raises(RigError, match=r"deepest place, 1.2 mm, not the . N to press to"):
         take_all(work)
     assert work.rig.arm.progress().done
@@ -421,7 +384,7 @@ def test_a_press_that_meets_its_deepest_place_first_is_an_error(tmp_path: Path) 
 
 
 def test_a_limit_of_force_stops_the_arm_on_its_way(tmp_path: Path) -> None:
-    work, campaign = session(tmp_path / "a", short(), TIMING, force={}, frame_camera=TRACKS)
+    work, campaign = felt(tmp_path, slides(1))
     work.rig.force_limit_n = 1.0
     clear: list[float] = []
     stop = work.rig.arm.stop

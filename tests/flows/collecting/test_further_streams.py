@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from decimal import Decimal
@@ -36,6 +37,7 @@ from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import answer, here
 from tests.conftest import ROOT
+from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import checksums, short, take_all
 from tests.flows.collecting.test_session import session as plain_session
 from tests.flows.conftest import write
@@ -64,13 +66,7 @@ HEARD = {
     **BACK,
     "rate_hz": 50,
     "timing": {"grade": "host arrival", "delay": {"shortest_us": 3000, "longest_us": 9000}},
-    "mock": {
-        "px_per_mm": 4,
-        "rate_hz": 50,
-        "level": "tracks",
-        "latency_us": 4000,
-        "arrival_jitter_us": 4000,
-    },
+    "mock": FREE["mock"] | {"rate_hz": 50, "latency_us": 4000, "arrival_jitter_us": 4000},
 }
 WARM = {
     "kind": "scalar",
@@ -85,15 +81,8 @@ WRIST = {
 }
 TWIN = {"kind": "events", "mock": {}}
 """As the rig's first event camera, with pixels and a clock of its own."""
-ALL = {
-    "side": SIDE,
-    "twin": TWIN,
-    "back": BACK,
-    "free": FREE,
-    "heard": HEARD,
-    "wrist": WRIST,
-    "warm": WARM,
-}
+ALL = {"side": SIDE, "twin": TWIN, "back": BACK, "free": FREE, "heard": HEARD}
+ALL |= {"wrist": WRIST, "warm": WARM}
 
 
 def session(
@@ -136,13 +125,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
     record = taken.record
     assert {name: stream.kind for name, stream in record.streams.items()} == {
-        "side": "events",
-        "twin": "events",
-        "back": "frames",
-        "free": "frames",
-        "heard": "frames",
-        "wrist": "wrench",
-        "warm": "scalar",
+        name: stream["kind"] for name, stream in ALL.items()
     }
     seconds = record.recorded_s
     side, back = record.streams["side"], record.streams["back"]
@@ -150,9 +133,8 @@ def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
     assert side.rows != record.counts.events
     assert (side.size_px, back.size_px, back.px_per_mm) == ((320, 240), (160, 160), 4)
     assert side.pulses == pytest.approx(record.counts.pulses, abs=12)
-    assert back.rows == pytest.approx(100 * seconds, rel=0.15)
-    assert record.streams["free"].rows == pytest.approx(60 * seconds, rel=0.2)
-    assert record.streams["heard"].rows == pytest.approx(50 * seconds, rel=0.25)
+    for name, rate_hz, within in (("back", 100, 0.15), ("free", 60, 0.2), ("heard", 50, 0.25)):
+        assert record.streams[name].rows == pytest.approx(rate_hz * seconds, rel=within)
     images = list(taken.frames(stream="back"))
     assert len(images) == back.rows
     assert images[0].shape == (160, 160)
@@ -166,15 +148,12 @@ def test_every_stream_is_stored_and_counted(taken: Recording) -> None:
 def test_every_clock_holds_its_uncertainty_against_the_truth(taken: Recording) -> None:
     clocks, truth = taken.record.clocks.streams, (taken.simulation_truth() or {})["clocks"]
     grades = {name: (clock.grade, clock.kind) for name, clock in clocks.items()}
-    assert grades == {
-        "side": ("trigger input", "95 %"),
-        "twin": ("trigger input", "95 %"),
-        "back": ("hardware trigger", "95 %"),
-        "free": ("device time stamps", "hard bound"),
-        "heard": ("host arrival", "hard bound"),
-        "wrist": ("host time", "hard bound"),
-        "warm": ("host arrival", "hard bound"),
-    }
+    assert grades == (
+        dict.fromkeys(("side", "twin"), ("trigger input", "95 %"))
+        | dict.fromkeys(("heard", "warm"), ("host arrival", "hard bound"))
+        | {"back": ("hardware trigger", "95 %"), "free": ("device time stamps", "hard bound")}
+        | {"wrist": ("host time", "hard bound")}
+    )
     for name, most_ns in (("free", 1e6), ("wrist", 3e6)):
         pairs = np.array(truth[name])
         error = np.abs(np.asarray(clocks[name].map.to_reference(pairs[:, 0])) - pairs[:, 1])
@@ -256,13 +235,8 @@ def test_a_further_force_sensor_feels_what_the_first_one_feels(tmp_path: Path) -
 def test_gates_and_catalogue_know_them(taken: Recording) -> None:
     gates = taken.record.quality.gates
     assert {f"sync_uncertainty_{name}_s" for name in ALL} <= gates.keys()
-    assert {
-        "event_gap_side_s",
-        "event_burst_side",
-        "frames_lost_back",
-        "frames_lost_free",
-        "frames_lost_heard",
-    } <= gates.keys()
+    assert {f"frames_lost_{name}" for name in ("back", "free", "heard")} <= gates.keys()
+    assert {"event_gap_side_s", "event_burst_side"} <= gates.keys()
     assert all(gate.passed for gate in gates.values())
     row = catalogue(Store.open(taken.folder.parents[3])).iloc[0]
     assert row["side_events"] == taken.record.streams["side"].rows
@@ -289,11 +263,11 @@ def test_the_public_interface_puts_them_on_one_time_line(taken: Recording) -> No
 
 
 def test_the_first_cameras_are_as_on_a_rig_without_them(tmp_path: Path) -> None:
-    alone, campaign = plain_session(tmp_path / "a", short(), frame_camera=TRACKS)
+    alone, campaign = plain_session(tmp_path / "a", slides(1), frame_camera=TRACKS)
     take_all(alone)
     # an identical rig, its two further cameras on the wire
-    both, more = session(tmp_path / "b", {"side": SIDE, "back": BACK})
-    both.take(pending_trials(both.plan, more)[:1])
+    both, more = session(tmp_path / "b", {"side": SIDE, "back": BACK}, data=slides(1))
+    take_all(both)
     (with_them,) = more.recordings()
     without = campaign.recording(with_them.trial_id)
     one, other = ((r.folder / "data.h5").read_bytes() for r in (with_them, without))
@@ -304,18 +278,18 @@ def test_the_first_cameras_are_as_on_a_rig_without_them(tmp_path: Path) -> None:
 
 
 def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
-    streams = {"side": SIDE, "warm": WARM}
-    whole, campaign = session(tmp_path / "a", streams)
+    streams, data = {"side": SIDE, "warm": WARM}, slides(2)
+    whole, campaign = session(tmp_path / "a", streams, data=data)
     take_all(whole)
     expected = checksums(campaign)
-    part, pieces = session(tmp_path / "b", streams)
+    part, pieces = session(tmp_path / "b", streams, data=data)
     part.take(pending_trials(part.plan, pieces)[:1])
     # killed in the second trial: its files stay behind, and go to quarantine
     trial = pending_trials(part.plan, pieces)[0]
     writer = pieces.begin(trial.id, None, 100)
     writer.add_stream("side", whole.rig.further[0].device.read())
     assert (writer.folder / "stream-side.h5").exists()
-    again, pieces = session(tmp_path / "b", streams)
+    again, pieces = session(tmp_path / "b", streams, data=data)
     take_all(again)
     assert checksums(pieces) == expected
     assert any(path.name.startswith(trial.id) for path in (pieces.folder / "quarantine").iterdir())
@@ -326,23 +300,21 @@ def record_calls(rig: Rig, called: list[str]) -> None:
     """Note in what order a rig's devices are stopped and closed."""
     devices = {"arm": rig.arm, "events": rig.event_camera, "sync": rig.sync}
     devices |= {device.name: device.device for device in rig.further}
-    for name, device in devices.items():
-        for what in ("stop", "close"):
-            done = getattr(device, what)
+    for name, what in itertools.product(devices, ("stop", "close")):
+        done = getattr(devices[name], what)
 
-            def noted(name: str = name, what: str = what, done: Any = done) -> None:
-                called.append(f"{what} {name}")
-                done()
+        def noted(call: str = f"{what} {name}", done: Any = done) -> None:
+            called.append(call)
+            done()
 
-            target = getattr(device, "_target", device)
-            setattr(target, what, noted)
+        setattr(getattr(devices[name], "_target", devices[name]), what, noted)
 
 
 @pytest.mark.parametrize("name", ["side", "back", "wrist", "warm"])
 def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path) -> None:
     streams = {"side": SIDE, "back": BACK, "wrist": WRIST, "warm": WARM}
-    fault = {"kind": "stream_gone", "stream": name, "trial": 2, "at_s": 0.3}
-    work, campaign = session(tmp_path / "a", streams, faults=[fault])
+    fault = {"kind": "stream_gone", "stream": name, "trial": 1, "at_s": 0.3}
+    work, campaign = session(tmp_path / "a", streams, data=slides(1), faults=[fault])
     called: list[str] = []
     record_calls(work.rig, called)
     text = rf"{name} \(further device\): does not answer \(simulated fault\)"
@@ -357,9 +329,9 @@ def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path)
     others = [call for call in called if call.startswith("close")]
     assert others[0] == "close arm"
     assert set(others[-2:]) <= {f"close {stream}" for stream in streams}
-    repaired, campaign = session(tmp_path / "a", streams)
+    repaired, campaign = session(tmp_path / "a", streams, data=slides(1))
     take_all(repaired)
-    assert len(campaign.committed()) == 3
+    assert len(campaign.committed()) == 1
 
 
 def test_a_camera_that_falls_silent_fails_a_gate(tmp_path: Path) -> None:
@@ -392,10 +364,8 @@ def test_a_camera_that_falls_silent_fails_a_gate(tmp_path: Path) -> None:
 def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
     store = Store.open(taken.folder.parents[3])
     counts = view.save(view.find(store, taken.trial_id), tmp_path / "t.rrd")
-    assert counts["side_events"] == taken.record.streams["side"].rows
-    assert counts["back_frames"] == taken.record.streams["back"].rows
-    assert counts["wrist_wrench"] == taken.record.streams["wrist"].rows
-    assert counts["warm_scalar"] == taken.record.streams["warm"].rows
+    for shown in ("side_events", "back_frames", "wrist_wrench", "warm_scalar"):
+        assert counts[shown] == taken.record.streams[shown.partition("_")[0]].rows
     read = Read(tmp_path / "t.rrd")
     times, values = read.curve("/streams/warm")
     assert values == list(taken.scalars("warm").value)
@@ -405,6 +375,14 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
     assert len(read["/streams/side/on", "Points2D:positions"][0]) > 10
 
 
+def timed(stream: dict[str, Any], name: str = "side", **timing: Any) -> dict[str, Any]:
+    """Streams of a rig file: one with another timing."""
+    return {name: {**stream, "timing": timing}}
+
+
+NO_MEANING = "has no meaning with driver: mock"
+
+
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
     [
@@ -412,21 +390,9 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
         ({"Side": SIDE}, "streams.Side", "a stream's name must match"),
         ({"side": {"kind": "pictures"}}, "streams.side.kind", "must be one of events, frames"),
         ({"side": {"kind": "events"}}, "streams.side.mock", "is needed by driver: mock"),
-        (
-            {"side": {**SIDE, "device": {"driver": "dvxplorer"}}},
-            "streams.side.device",
-            "has no meaning with driver: mock",
-        ),
-        (
-            {"side": {**SIDE, "mock": {"pixels": 5}}},
-            "streams.side.mock.pixels",
-            "unknown key",
-        ),
-        (
-            {"side": {**SIDE, "timing": {"grade": "host arrival"}}},
-            "streams.side.timing.grade",
-            "must be trigger input",
-        ),
+        ({"side": {**SIDE, "device": {"driver": "dvxplorer"}}}, "streams.side.device", NO_MEANING),
+        ({"side": {**SIDE, "mock": {"pixels": 5}}}, "streams.side.mock.pixels", "unknown key"),
+        (timed(SIDE, grade="host arrival"), "streams.side.timing.grade", "must be trigger input"),
         (
             {"back": {**BACK, "region_px": [160, 2000]}},
             "streams.back.region_px",
@@ -436,17 +402,17 @@ def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
         ({"free": {**FREE, "rate_hz": None}}, "streams.free.rate_hz", "is needed with"),
         ({"back": {**BACK, "rate_hz": 50}}, "streams.back.rate_hz", "has no meaning with"),
         (
-            {"side": {**SIDE, "timing": {"drift_ppm": 50, "jitter_us": 1}}},
+            timed(SIDE, drift_ppm=50, jitter_us=1),
             "mock.clocks.pulse_jitter_us",
             "must be at most streams.side.timing.jitter_us = 1",
         ),
         (
-            {"side": {**SIDE, "timing": {"drift_ppm": 20}}},
+            timed(SIDE, drift_ppm=20),
             "streams.side.mock.clock_ppm",
             "must be at most timing.drift_ppm = 20",
         ),
         (
-            {"warm": {**WARM, "timing": {"delay": {"shortest_us": 0, "longest_us": 2000}}}},
+            timed(WARM, "warm", delay={"shortest_us": 0, "longest_us": 2000}),
             "streams.warm.mock.arrival_jitter_us",
             "must be at most 1000",
         ),
@@ -480,10 +446,8 @@ def test_sync_shows_the_clock_of_each(taken: Recording) -> None:
     store = taken.folder.parents[3]
     devices = answer("sync", store)["campaigns"]["tiny"]["devices"]
     assert list(devices) == ["events", "frames", "arm", *sorted(ALL)]
-    assert devices["side"]["pulses"]["missed"] == 0
-    assert devices["side"]["grade"] == "trigger input"
-    assert devices["warm"]["pulses"] is None
-    assert devices["wrist"]["grade"] == "host time"
+    assert (devices["side"]["pulses"]["missed"], devices["warm"]["pulses"]) == (0, None)
+    assert [devices[name]["grade"] for name in ("side", "wrist")] == ["trigger input", "host time"]
     page = (store / "report" / "sync.html").read_text()
     assert "side, trigger input" in page
     assert "heard, host arrival" in page
@@ -495,17 +459,8 @@ def test_the_events_of_a_further_camera_are_exported_by_its_name(
     store = taken.folder.parents[3]
     for form in ("aedat4", "dsec"):
         folder = tmp_path / form
-        found = answer(
-            "export",
-            store,
-            taken.trial_id,
-            "--output",
-            folder,
-            "--format",
-            form,
-            "--stream",
-            "side",
-        )
+        where = ("export", store, taken.trial_id, "--output", folder)
+        found = answer(*where, "--format", form, "--stream", "side")
         assert found["events"] == taken.record.streams["side"].rows
         assert found["triggers"] == taken.record.streams["side"].pulses
         (path,) = folder.glob(f"*.{'h5' if form == 'dsec' else form}")
@@ -522,7 +477,6 @@ def test_readings_do_not_depend_on_how_often_they_are_read() -> None:
         file, _ = load_rig_file(ROOT / "rigs" / "mock_two_cameras.yaml")
         rig = build_rig(file)
         rig.connect()
-        assert rig.simulation is not None
         rig.simulation.begin_trial(3)
         side, _, warm = (further.device for further in rig.further)
         for device in (side, warm):
@@ -572,29 +526,20 @@ def test_the_estimate_counts_further_cameras(tmp_path: Path) -> None:
     one, all_of_them = (trial_bytes(work.rig_file, work.plan, trial) for work in (alone, more))
     known, seconds = alone.rig_file.estimates, alone.plan.seconds(trial, recorded_only=True)
     first_px = alone.rig_file.frame_px(alone.plan)
-    assert first_px is not None
     events = one - known.fixed_bytes - known.bytes_per_tracked_frame * seconds * 100
     back = known.bytes_per_frame * 160 * 160 / (first_px[0] * first_px[1]) * seconds * 100
     free = known.bytes_per_tracked_frame * seconds * 60
     assert all_of_them - one == pytest.approx(events + back + free)
 
 
+PUBLISHED = ("--as", "croissant", "--licence", "CC-BY-4.0", "--creator", "Somebody")
+
+
 def test_a_publication_has_their_files_and_describes_their_columns(
     taken: Recording, tmp_path: Path
 ) -> None:
     folder = tmp_path / "published"
-    answer(
-        "export",
-        taken.folder.parents[3],
-        "--as",
-        "croissant",
-        "--output",
-        folder,
-        "--licence",
-        "CC-BY-4.0",
-        "--creator",
-        "Somebody",
-    )
+    answer("export", taken.folder.parents[3], *PUBLISHED, "--output", folder)
     (trial,) = (folder / "campaigns" / "tiny" / "trials").iterdir()
     assert (trial / "stream-back.mkv").read_bytes() == taken.video("back").read_bytes()  # type: ignore[union-attr]
     assert (trial / "stream-side.h5").is_file()

@@ -112,7 +112,6 @@ def test_nothing_that_was_sent_is_lost(taken: Taken) -> None:
 
 def with_arm(file: RigFile, kind: str) -> RigFile:
     """The same rig with an ABB arm, whose times are known by their arrival only."""
-    assert file.devices is not None
     given = file.devices.arm
     common = {"host": own_address(), "tool": given.tool, "limits": given.limits}
     arm: AbbSettings | AbbSocketSettings
@@ -142,5 +141,4 @@ def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> 
     assert gates["sync_uncertainty_frames_s"].grade == "hardware trigger"
     # what is true is told from when this slide was asked for, by whatever clock the arm has
     truth = recording.simulation_truth()
-    assert truth is not None
     assert -50_000_000 < recording.step("slide")[0] - truth["reference_ns"] < 1_000_000_000

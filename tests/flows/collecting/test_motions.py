@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.conftest import ROOT
@@ -21,6 +22,21 @@ from tests.flows.live import free_udp_port, rig_yaml
 from tests.rigs.waiting import own_address
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
+
+
+def template(name: str, **values: str) -> dict[str, str]:
+    """A template's motion with the depth and the speed as factors."""
+    shared = {"depth": "$depth", "speed": "$speed", "settle": "0.5 s", "hold": "1.5 s"}
+    return {"template": name, **shared, **values}
+
+
+def agrees(recording: Recording, store: Path) -> dict[str, Any]:
+    """The label of a store's only trial, whose onsets are the true ones within three frames."""
+    (path,) = (store / "derived" / "labels").rglob("*.json")
+    found, truth = read_json(path), recording.simulation_truth() or {}
+    for onset in ("incipient_ns", "gross_ns"):
+        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6
+    return found
 
 
 def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> Store:
@@ -65,50 +81,26 @@ def test_slip_is_looked_for_in_all_moves_in_contact(tmp_path: Path) -> None:
 
 
 def test_a_campaign_keeps_its_motion_written_out(tmp_path: Path) -> None:
-    motion = {
-        "template": "kinematic",
-        "depth": "$depth",
-        "distance": "5 mm",
-        "speed": "$speed",
-        "direction": "90 deg",
-        "settle": "0.5 s",
-        "hold": "1.5 s",
-    }
+    motion = template("kinematic", distance="5 mm", direction="90 deg")
     store = collected(tmp_path, motion)
     kept = yaml.safe_load(store.campaign("moves").protocol_file.read_text())
-    assert [phase["phase"] for phase in kept["collection"]["motion"]] == [
-        "approach",
-        "press",
-        "hold",
-        "slide",
-        "release",
-        "return",
-    ]
+    phases = [phase["phase"] for phase in kept["collection"]["motion"]]
+    assert phases == ["approach", "press", "hold", "slide", "release", "return"]
     # and goes on with the protocol that names the template
     make_request(tmp_path / "moves.yaml", RIG, tmp_path / "store")
 
 
 def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
     """The outer papillae slip first; gross slip begins with the last besides the centre one."""
-    motion = {
-        "template": "press_twist",
-        "depth": "$depth",
-        "angle": "-40 deg",
-        "speed": "$speed",
-        "settle": "0.5 s",
-        "hold": "1.5 s",
-    }
+    motion = template("press_twist", angle="-40 deg")
     store = collected(tmp_path, motion, speed={"unit": "deg/s", "values": [8]})
     (recording,) = store.campaign("moves").recordings()
     assert recording.motion_phase == "twist"
     begin, end = recording.motion_ns
     assert abs((end - begin) / 1e9 - 5.0) < 0.02
-    found = read_json(next((tmp_path / "store" / "derived" / "labels" / "moves").glob("*.json")))
+    found = agrees(recording, store.folder)
+    assert begin < found["incipient_ns"] < found["gross_ns"] < end
     truth = recording.simulation_truth()
-    assert truth is not None
-    for onset in ("incipient_ns", "gross_ns"):
-        assert begin < found[onset] < end
-        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
     assert truth["per_papilla_ns"][0] is None  # the centre turns on the spot
     assert found["gross_ns"] - found["incipient_ns"] > 1e9
 
@@ -130,25 +122,13 @@ def test_a_twist_is_collected_and_labelled_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.xdist_group("scene")
 def test_a_twist_of_a_ur_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
     """The real driver on its fake, which moves the sensor in the simulated scene."""
-    motion = {
-        "template": "press_twist",
-        "depth": "$depth",
-        "angle": "40 deg",
-        "speed": "$speed",
-        "settle": "0.5 s",
-        "hold": "1.5 s",
-        "press": "4 mm/s",
-    }
+    motion = template("press_twist", angle="40 deg", press="4 mm/s")
     speed = {"unit": "deg/s", "values": [10]}
     store = collected(tmp_path, motion, rig_yaml(tmp_path), speed=speed)
     (recording,) = store.campaign("moves").recordings()
     begin, end = recording.motion_ns
     assert (end - begin) / 1e9 == pytest.approx(40 / 10 + 0.2, abs=0.1)  # with its ramps
-    found = read_json(next((tmp_path / "store" / "derived" / "labels" / "moves").glob("*.json")))
-    truth = recording.simulation_truth()
-    assert truth is not None
-    for onset in ("incipient_ns", "gross_ns"):
-        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
+    agrees(recording, store.folder)
 
 
 def abb_yaml(folder: Path, driver: str = "abb") -> Path:
@@ -198,11 +178,7 @@ def test_a_twist_of_an_abb_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
     (recording,) = Store.open(store).campaign("press_twist").recordings()
     begin, end = recording.motion_ns
     assert (end - begin) / 1e9 == pytest.approx(40 / 10, abs=0.3)
-    (label,) = (store / "derived" / "labels" / "press_twist").glob("*.json")
-    found, truth = read_json(label), recording.simulation_truth()
-    assert truth is not None
-    for onset in ("incipient_ns", "gross_ns"):
-        assert abs(found[onset] - truth["from_hold"][onset]) < 30e6  # three frames
+    agrees(recording, store)
 
 
 def test_an_arm_that_rests_between_pieces_is_refused_a_twist_beforehand(tmp_path: Path) -> None:

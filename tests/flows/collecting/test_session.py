@@ -106,9 +106,7 @@ def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     assert campaign.committed() == set()
     assert len(campaign.quarantined()) == 6
     assert pending_trials(work.plan, campaign) == []
-    run_request = make_request(
-        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
-    )
+    run_request = make_request(*(tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store")))
     counts = run_request.counts(campaign)
     assert counts["planned"] == counts["committed"] + counts["missing"] == 3
     assert len(counts["set_aside"]) == 3

@@ -79,16 +79,13 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
         if len(waits) == 3:
             control.ask(store, "resume", who="ben")
 
-    assert work.supervisor is not None
     work.supervisor.wait, work.supervisor.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
     assert pauses == [3 * supervising.POLL_S]
     asked = control.requests(store)
-    assert [(item.kind, item.who, item.why) for item in asked] == [
-        ("pause", "anna", "lunch"),
-        ("resume", "ben", ""),
-    ]
+    known = [(item.kind, item.who, item.why) for item in asked]
+    assert known == [("pause", "anna", "lunch"), ("resume", "ben", "")]
     answers = [control.answered(store, item) for item in asked]
     assert [answer and answer["did"]["paused"] for answer in answers] == [True, False]
     assert checksums(campaign) == checksums(untouched)
@@ -99,7 +96,6 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
 ) -> None:
     monkeypatch.setattr(supervising, "PAUSE_LIMIT_S", 2.0)
     work, campaign, store = supervised(tmp_path / "a")
-    assert work.supervisor is not None
     work.supervisor.wait = lambda seconds: None
     with pytest.raises(CampaignStopped, match=r"pause by anna.*nobody resumed it: `sliplab resume"):
         after_first(work, lambda: control.ask(store, "pause", who="anna"))
@@ -112,18 +108,13 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
 
 def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path) -> None:
     data = short()
-    data["collection"]["maintenance"]["warm_up"] = {
-        "presses": 1,
-        "depth": "2.4 mm",
-        "speed": "2 mm/s",
-        "clearance": "5 mm",
-    }
+    warm_up = {"presses": 1, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
+    data["collection"]["maintenance"]["warm_up"] = warm_up
     work, campaign, store = supervised(tmp_path / "a", data)
     done: list[str] = []
     press, touch_off = work.rig.press, work.rig.touch_off
     work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
     work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
-    assert work.supervisor is not None
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["warm up", "zero"] * 2
@@ -139,7 +130,6 @@ def test_a_stop_that_came_by_file_is_heeded_at_the_next_boundary(tmp_path: Path)
     assert campaign.quarantined() == []
     (request,) = control.requests(store)
     answer = control.answered(store, request)
-    assert answer is not None
     assert answer["did"]["stopped"]
 
 
@@ -147,9 +137,7 @@ def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
     work, _, store = supervised(tmp_path / "a")
     work.rig.close()
     control.ask(store, "stop")
-    run_request = make_request(
-        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
-    )
+    run_request = make_request(*(tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store")))
     with open_session(run_request) as work_now:
         work_now.collector.rig.connect()
         work_now.collector.take(work_now.trials)
@@ -169,17 +157,12 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert outcomes == [(first, "committed"), (second, "skipped"), (third, "committed")]
     (request, _) = control.requests(store)
     answer = control.answered(store, request)
-    assert answer is not None
-    assert answer["did"]["trials"] == {
-        second: "set aside",
-        first: "is committed: left as it is",
-    }
+    assert answer["did"]["trials"] == {second: "set aside", first: "is committed: left as it is"}
     (aside,) = excluded_trials(work.plan, campaign)
     assert (aside["trial"], aside["cause"], aside["by"]) == (second, "cable in the way", "anna")
     assert skipped(campaign)[second]["request"] == 1
     (kept,) = campaign.quarantined()
     assert (kept["cause"], kept["asked"]["who"]) == ("again: dust", "ben")
-    assert work.supervisor is not None
     again = work.supervisor.more()
     assert [trial.id for trial in again] == [first]
     work.take(again)

@@ -34,19 +34,17 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     work, campaign, run_request = begin(tmp_path / "a", short())
     left = [RESERVE + 1e9, RESERVE + 1e9, RESERVE + 1000]
     disk = DiskWatch(run_request, campaign, lambda folder: int(left.pop(0)))
-    work.supervisor = CollectionSupervisor(
-        run_request, Store.open(run_request.store), campaign, disk
-    )
+    store = Store.open(run_request.store)
+    work.supervisor = CollectionSupervisor(run_request, store, campaign, disk)
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
-    message = str(stopped.value)
     for part in (
         "stopped, the disk is nearly full: 200.0 MB are free",
         "(by the trials so far)",
         "200.0 MB stay in reserve",
         "make room, then run the same command to resume",
     ):
-        assert part in message
+        assert part in str(stopped.value)
     assert len(campaign.committed()) == 2
     assert campaign.quarantined() == []
     assert not list((campaign.folder / "incoming").iterdir())
@@ -70,7 +68,6 @@ def test_what_a_trial_needs_comes_from_the_plan_then_from_the_trials(tmp_path: P
     spooling = run_request.rig.model_copy(update={"frame_camera": camera})
     raw = DiskWatch(RunRequest(**{**vars(run_request), "rig": spooling}), campaign)
     frame = run_request.rig.frame_px(run_request.plan)
-    assert frame is not None
     seconds = run_request.plan.seconds(second, recorded_only=True)
     assert raw.needs(second) - disk.needs(second) == frame[0] * frame[1] * 100 * seconds
 
@@ -94,8 +91,7 @@ def test_references_that_drift_apart_stop_the_campaign(
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
     monkeypatch.setattr(
-        "sliplab.flows.collecting.watches.hold_rate",
-        lambda recording: rates[recording.trial_id],
+        "sliplab.flows.collecting.watches.hold_rate", lambda recording: rates[recording.trial_id]
     )
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))

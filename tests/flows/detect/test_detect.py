@@ -29,16 +29,8 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
-from tests.flows.detect.detecting import (
-    RIG,
-    keeping,
-    model_in,
-    ordered,
-    short_slide,
-    slip_when_busy,
-    stands_clear,
-    untrained,
-)
+from tests.flows.detect import detecting
+from tests.flows.detect.detecting import RIG, keeping, ordered, slip_when_busy, stands_clear
 from tests.flows.live import request_in, take_all
 
 
@@ -47,7 +39,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The same trial as `collect` takes it, by a rig that looks as often: moves end with a look."""
     folder = tmp_path_factory.mktemp("stored")
     rig_file = write(folder / "r.yaml", {"extends": str(RIG), "poll": "5 ms"})
-    order = request_in(folder / "at", short_slide(), rig_file)
+    order = request_in(folder / "at", detecting.short_slide(), rig_file)
     campaign = describe_campaign(Store.create(order.store), order)
     rig = build_rig(order.rig)
     rig.connect()
@@ -58,7 +50,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.mark.parametrize(("outputs", "margin"), [(1, 2.0), (4, 8.0)])
 def test_the_margin_is_in_spikes_of_the_model(outputs: int, margin: float, tmp_path: Path) -> None:
-    model, pilot = model_in(tmp_path, outputs), ROOT / "protocols" / "pilot.yaml"
+    model, pilot = detecting.model_in(tmp_path, outputs), ROOT / "protocols" / "pilot.yaml"
     listening = make_detect_request(RIG, model, seconds=1.0)
     trial = "depth=2.4mm,speed=1.6mmps,direction=0deg"
     moving = make_detect_request(RIG, model, protocol=pilot, trial=trial)
@@ -69,7 +61,7 @@ def test_the_margin_is_in_spikes_of_the_model(outputs: int, margin: float, tmp_p
 
 
 def test_a_stored_trial_gives_the_offline_windows_and_decisions(stored: Recording) -> None:
-    fitted, rule = untrained(), Detection(smoothing=3, margin=1)
+    fitted, rule = detecting.untrained(), Detection(smoothing=3, margin=1)
     x, end_ns = trial_windows(stored, fitted.windows)
     counts = predict_counts(fitted, x)
     assert len(np.unique(counts, axis=0)) > 5
@@ -95,15 +87,8 @@ def test_a_stored_trial_gives_the_offline_windows_and_decisions(stored: Recordin
     made = []
     for begin in range(0, len(events), 997):
         piece = slice(begin, begin + 997)
-        made += live.push(
-            replace(
-                events,
-                x=events.x[piece],
-                y=events.y[piece],
-                p=events.p[piece],
-                t_us=events.t_us[piece],
-            )
-        )
+        columns = {name: column[piece] for name, column in vars(events).items()}
+        made += live.push(replace(events, **columns))
     made += live.advance(starts_us[-1] + length_ns // 1000)
     np.testing.assert_array_equal(np.concatenate(seen), x.dense())
     assert [item.counts for item in made] == [tuple(row) for row in counts.tolist()]
@@ -123,7 +108,7 @@ def test_the_live_trial_is_the_stored_one(
     assert result["windows"] == len(lines)
     assert result["simulated"] is True
     starts_us = np.array([line["start_us"] for line in lines])
-    events, fitted = stored.events(), untrained()
+    events, fitted = stored.events(), detecting.untrained()
     with stored.open() as file:
         first_pulse_us = file.pulses("event_pulses")[0] // 1000
     # what arrives first begins the windows
@@ -221,14 +206,9 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
 ) -> None:
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}
-    order = make_detect_request(
-        RIG,
-        model,
-        protocol=write(tmp_path / "g.yaml", data),
-        trial="mass=0.165kg",
-        reflex="stop",
-        hold_s=0.2,
-    )
+    protocol = write(tmp_path / "g.yaml", data)
+    options = {"trial": "mass=0.165kg", "reflex": "stop", "hold_s": 0.2}
+    order = make_detect_request(RIG, model, protocol=protocol, **options)
     rigs: list[Rig] = []
     truth: list[dict[str, Any]] = []
 
@@ -256,5 +236,4 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     assert result["reflex"]["stopped_mm"][2] < 3.4
     assert stands_clear(rigs[0])
     plate = rigs[0].plate
-    assert plate is not None
     assert plate.mass_kg() == 0.165

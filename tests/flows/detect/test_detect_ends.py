@@ -21,13 +21,7 @@ from sliplab.rigs.rig_file import RigFile
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
-from tests.flows.detect.detecting import (
-    RIG,
-    keeping,
-    ordered,
-    slip_when_busy,
-    stands_clear,
-)
+from tests.flows.detect.detecting import RIG, keeping, ordered, slip_when_busy, stands_clear
 
 # -- how it ends -----------------------------------------------------------------------------
 
@@ -73,11 +67,8 @@ def test_a_camera_whose_clock_falls_back_ends_it(
 
 
 def test_listening_moves_nothing_and_judges_silence(model: Path, tmp_path: Path) -> None:
-    silent = {
-        "extends": str(RIG),
-        "name": "silent",
-        "mock": {"event_camera": {"noise_hz": 0, "hot_pixels": 0}},
-    }
+    quiet = {"event_camera": {"noise_hz": 0, "hot_pixels": 0}}
+    silent = {"extends": str(RIG), "name": "silent", "mock": quiet}
     order = make_detect_request(write(tmp_path / "r.yaml", silent), model, seconds=1.5)
     rigs: list[Rig] = []
     result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
@@ -123,27 +114,18 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
     [
         ({"reflex": "stop"}, "--reflex = 'stop'|--reflex = stop: needs --protocol"),
         ({}, "--seconds: is needed on rehearsal"),
-        (
-            {"protocol": 1, "trial": "", "seconds": 3.0},
-            "--seconds = 3.0: applies only without --protocol",
-        ),
-        ({"protocol": 1, "trial": "", "reflex": "jump"}, "must be 'stop', 'press:MM' or 'grip:MM'"),
-        (
-            {"protocol": 1, "trial": "", "reflex": "press:-1"},
-            "must be 'stop', 'press:MM' or 'grip:MM'",
-        ),
-        (
-            {"protocol": 1, "trial": "", "reflex": "grip:0.4"},
-            "needs a gripper, and the rig rehearsal",
-        ),
-        ({"protocol": 1, "trial": "depth=9mm"}, "fits no trial: depth=2.4mm,direction=0deg"),
+        ({"trial": "", "seconds": 3.0}, "--seconds = 3.0: applies only without --protocol"),
+        ({"trial": "", "reflex": "jump"}, "must be 'stop', 'press:MM' or 'grip:MM'"),
+        ({"trial": "", "reflex": "press:-1"}, "must be 'stop', 'press:MM' or 'grip:MM'"),
+        ({"trial": "", "reflex": "grip:0.4"}, "needs a gripper, and the rig rehearsal"),
+        ({"trial": "depth=9mm"}, "fits no trial: depth=2.4mm,direction=0deg"),
         ({"seconds": 1.0, "stride_ms": 31.0}, "--stride = 31 ms: must be over 0"),
     ],
 )
 def test_wrong_input_is_said(
     model: Path, protocol: Path, options: dict[str, Any], said: str
 ) -> None:
-    if "protocol" in options:
+    if "trial" in options:
         options = {**options, "protocol": protocol}
     with pytest.raises(InputError, match=said):
         make_detect_request(RIG, model, **options)
@@ -177,11 +159,10 @@ def test_a_condition_may_leave_out_what_is_clear() -> None:
 
 def test_the_command(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "d.jsonl"
-    done = here(
-        "detect", "--rig", "rehearsal", "--model", model, "--seconds", "0.5", "--out", out, "--json"
-    )
+    command = ("detect", "--rig", "rehearsal", "--model", model)
+    done = here(*command, "--seconds", "0.5", "--out", out, "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["windows"] == len(out.read_text().splitlines()) > 10
     assert "simulated listening" in done.stderr
-    assert here("detect", "--rig", "rehearsal", "--model", model).returncode == 2
+    assert here(*command).returncode == 2

@@ -14,15 +14,9 @@ import pytest
 
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program
 from sliplab.rigs.build import simulated_rig
+from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.reacting import (
-    Reaction,
-    Reflex,
-    SafeState,
-    SenseLost,
-    SlipDetected,
-    run_watched,
-)
+from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.path import SENSOR
 from sliplab.rigs.mock.settings import MockSettings
@@ -58,7 +52,6 @@ class Drawn(NullSink):
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Raise what is due."""
-        assert self.began_ns is not None
         passed_s = (self._devices.clock.now_ns() - self.began_ns) / 1e9
         if passed_s < self._due_s:
             return
@@ -115,7 +108,6 @@ def reflex(
 ) -> Reflex:
     """Draw a reflex within the rig's ranges; what is over the depth is for the rig to cut off."""
     gripper = FILE.gripper_range
-    assert gripper is not None
     press = kind == "press"
     return Reflex(
         kind,
@@ -151,7 +143,7 @@ def one_trial(number: int) -> str:
         rig.connect()
         made = run_watched(rig, program(rng, deepest_mm), watcher, number, 100, wanted, safe)
         ended = "no reflex" if made is None else wanted.kind
-    except SafeState as lost:
+    except reacting.SafeState as lost:
         made, ended = lost.reaction, "safe state"
         assert made.command_ms + made.actuator_ms <= SAFE_MS, number
         assert not devices.world.path.moving(devices.world.now_ns), number
@@ -178,7 +170,6 @@ def check_limits(
     sensor = world.path.commanded(t_ns, SENSOR)[:, :3]  # a fault moves the tool besides
     speed = np.linalg.norm(np.diff(sensor, axis=0), axis=1) * 1e3
     assert speed.max(initial=0.0) <= ARM_MM_S * (1 + 1e-6), number
-    assert world.fingers is not None
     opening = world.fingers.opening_mm(t_ns)
     closing = -np.diff(opening) * 1e3
     assert closing.max(initial=0.0) <= finger_mm_s * (1 + 1e-6), number

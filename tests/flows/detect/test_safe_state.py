@@ -33,16 +33,24 @@ STREAM_MS, DECISION_MS = 200.0, 100.0
 """Timeouts of that rig file."""
 
 
-def gripping(
-    model: Path,
-    protocol: Path,
-    folder: Path,
-    change: dict[str, Any] | None = None,
-    reflex: str = "grip:0.4",
-) -> DetectRequest:
+@pytest.fixture
+def gripping(model: Path, protocol: Path, tmp_path: Path) -> Callable[..., DetectRequest]:
     """A trial on the rig with a gripper, with changes of its file."""
-    file = write(folder / "rig.yaml", {"extends": str(RIG), **(change or {})})
-    return make_detect_request(file, model, protocol=protocol, trial="", reflex=reflex, hold_s=0.2)
+
+    def request(action: str = "grip:0.4", **change: Any) -> DetectRequest:
+        file = write(tmp_path / "rig.yaml", {"extends": str(RIG), **change})
+        options = {"protocol": protocol, "trial": "", "reflex": action, "hold_s": 0.2}
+        return make_detect_request(file, model, **options)
+
+    return request
+
+
+Gripping = Callable[..., DetectRequest]
+
+
+def gone(device: str, at_s: float) -> dict[str, Any]:
+    """A simulated rig of which a device goes."""
+    return {"faults": [{"kind": "device_gone", "device": device, "at_s": at_s}]}
 
 
 def quiet(x: np.ndarray) -> np.ndarray:
@@ -69,9 +77,7 @@ def safe_state(
 # -- the safe state --------------------------------------------------------------------------
 
 
-def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(gripping: Gripping) -> None:
     """The camera sends nothing any more, neither events nor pulses."""
     silent_ns: list[int] = []
 
@@ -90,7 +96,7 @@ def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(
             lambda: type(pulses())(np.empty(0, np.int64)) if silent() else pulses()
         )
 
-    order = gripping(model, protocol, tmp_path)
+    order = gripping()
     error, rig = safe_state(order, quiet, disturb)
     assert "neither events nor pulses" in error.cause
     assert "the safe state 'grip' was reached" in str(error)
@@ -106,9 +112,7 @@ def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(
     assert -3.5 < rig.position().x_mm < 3.4
 
 
-def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(gripping: Gripping) -> None:
     """What was read arrives at half the rate: all data are newer, and later, than the last."""
     ages_ms = [0.0]
 
@@ -132,36 +136,23 @@ def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(
         rig.events.read = slowed(rig.events.read, rig)  # type: ignore[method-assign]
         rig.events.read_pulses = slowed(rig.events.read_pulses, rig)  # type: ignore[method-assign]
 
-    error, rig = safe_state(gripping(model, protocol, tmp_path), quiet, disturb)
+    error, rig = safe_state(gripping(), quiet, disturb)
     assert "neither events nor pulses" in error.cause
     assert max(ages_ms) < 2 * STREAM_MS + 100.0
     assert rig.position().depth_mm > 2.0
 
 
+@pytest.mark.parametrize(("at_s", "phase"), [(0.1, "hold"), (1.0, "slide")])
 def test_a_camera_that_fails_leads_to_the_safe_state(
-    model: Path, protocol: Path, tmp_path: Path
+    gripping: Gripping, at_s: float, phase: str
 ) -> None:
-    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
-    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
-    error, rig = safe_state(order, quiet)
+    error, rig = safe_state(gripping(mock=gone("event_camera", at_s)), quiet)
     assert "event camera: does not answer" in error.cause
-    assert error.reaction.closed_mm == pytest.approx(0.2)
+    assert (error.reaction.phase, error.reaction.closed_mm) == (phase, pytest.approx(0.2))
     assert rig.position().depth_mm > 2.0
 
 
-def test_a_camera_that_fails_in_the_hold_leads_there_too(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
-    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 0.1}
-    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
-    error, rig = safe_state(order, quiet)
-    assert error.reaction.phase == "hold"
-    assert rig.position().depth_mm > 2.0
-
-
-def test_a_dead_network_leads_to_the_safe_state(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_dead_network_leads_to_the_safe_state(model: Path, gripping: Gripping) -> None:
     network = NetworkProcess(model, 30.0)
     asked: list[int] = []
 
@@ -171,7 +162,7 @@ def test_a_dead_network_leads_to_the_safe_state(
             network.kill()
         return quiet(x) if network(x).shape == (1, 3) else x
 
-    order = gripping(model, protocol, tmp_path, {"reflex": {"safe_state": "stop"}})
+    order = gripping(reflex={"safe_state": "stop"})
     error, rig = safe_state(order, dying)
     assert len(asked) == 30  # at once
     assert "network: counts: the network's process has exited" in error.cause
@@ -180,9 +171,7 @@ def test_a_dead_network_leads_to_the_safe_state(
     network.close()
 
 
-def test_a_late_decision_leads_to_the_safe_state(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_late_decision_leads_to_the_safe_state(gripping: Gripping) -> None:
     rigs: list[Rig] = []
     asked: list[int] = []
 
@@ -192,17 +181,14 @@ def test_a_late_decision_leads_to_the_safe_state(
             rigs[0].clock.wait((DECISION_MS + 1.0) / 1e3)
         return quiet(x)
 
-    order = gripping(model, protocol, tmp_path)
+    order = gripping()
     error, _ = safe_state(order, slow, rigs.append)
     assert "a decision took 101 ms, and reflex.decision_timeout is 100 ms" in error.cause
     assert len(asked) < 30
 
 
-def test_a_gripper_that_fails_leaves_the_arm_stopped_in_contact(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
-    gone = {"kind": "device_gone", "device": "gripper", "at_s": 0.6}
-    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}})
+def test_a_gripper_that_fails_leaves_the_arm_stopped_in_contact(gripping: Gripping) -> None:
+    order = gripping(mock=gone("gripper", 0.6))
     error, rig = safe_state(order, slip_when_busy())
     assert "gripper: does not answer" in error.cause
     assert "the safe state 'stop'" in str(error)
@@ -210,11 +196,8 @@ def test_a_gripper_that_fails_leaves_the_arm_stopped_in_contact(
     assert rig.arm.progress().done
 
 
-def test_without_a_safe_state_a_failure_moves_the_arm_clear(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
-    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
-    order = gripping(model, protocol, tmp_path, {"mock": {"faults": [gone]}, "reflex": None})
+def test_without_a_safe_state_a_failure_moves_the_arm_clear(gripping: Gripping) -> None:
+    order = gripping(mock=gone("event_camera", 1.0), reflex=None)
     rigs: list[Rig] = []
     with pytest.raises(RigError, match="event camera") as found:
         detect(order, counting=quiet, build=keeping(rigs))
@@ -223,9 +206,9 @@ def test_without_a_safe_state_a_failure_moves_the_arm_clear(
 
 
 @pytest.mark.parametrize("how", ["silent", "frozen"])
-@pytest.mark.parametrize("settings", [None, {}], ids=["no safe state", "safe state"])
+@pytest.mark.parametrize("stays", [False, True], ids=["no safe state", "safe state"])
 def test_events_that_stop_or_freeze_stop_a_reflex_trial(
-    settings: dict[str, Any] | None, how: str, model: Path, protocol: Path, tmp_path: Path
+    stays: bool, how: str, gripping: Gripping
 ) -> None:
     """With a safe state the arm stays; without one it moves clear, as after any failure."""
     rigs: list[Rig] = []
@@ -256,35 +239,22 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
         )
         return rig
 
-    change = {} if settings is None else {"reflex": {"safe_state": "stop", **settings}}
-    order = gripping(model, protocol, tmp_path, {"reflex": None} | change)
-    expected = RigError if settings is None else SafeState
+    order = gripping(reflex={"safe_state": "stop"} if stays else None)
+    expected = SafeState if stays else RigError
     said = "event camera: neither events nor pulses|event camera: .*clock|fell back"
     with pytest.raises(expected, match=said):
         detect(order, counting=quiet, build=build)
     assert rigs[0].arm.progress().done
-    assert (rigs[0].position().depth_mm < 0) == (settings is None)
+    assert (rigs[0].position().depth_mm < 0) != stays
 
 
 def test_the_command_says_what_was_lost_and_fails(
     model: Path, protocol: Path, tmp_path: Path
 ) -> None:
-    gone = {"kind": "device_gone", "device": "event_camera", "at_s": 1.0}
-    file = write(tmp_path / "rig.yaml", {"extends": str(RIG), "mock": {"faults": [gone]}})
-    done = here(
-        "detect",
-        "--rig",
-        file,
-        "--model",
-        model,
-        "--protocol",
-        protocol,
-        "--trial",
-        "depth=2.4mm",
-        "--reflex",
-        "grip:0.4",
-        "--json",
-    )
+    change = {"extends": str(RIG), "mock": gone("event_camera", 1.0)}
+    asked = ("--rig", write(tmp_path / "rig.yaml", change), "--model", model, "--json")
+    trial = ("--protocol", protocol, "--trial", "depth=2.4mm", "--reflex", "grip:0.4")
+    done = here("detect", *asked, *trial)
     assert done.returncode == 1
     error = json.loads(done.stdout)["error"]
     assert "event camera: does not answer" in error["message"]
@@ -295,19 +265,15 @@ def test_the_command_says_what_was_lost_and_fails(
 # -- grips -----------------------------------------------------------------------------------
 
 
-def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(gripping: Gripping) -> None:
     rigs: list[Rig] = []
-    order = gripping(model, protocol, tmp_path)
+    order = gripping()
     result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
     reflex = result["reflex"]
-    assert reflex
-    assert reflex["done"]
+    assert (reflex["done"], reflex["stalled"]) == (True, False)
     assert reflex["stopped_mm"][2] == pytest.approx(2.4, abs=0.01)
     assert reflex["depth_mm"] == pytest.approx(2.8, abs=0.01)
     assert reflex["closed_mm"] == pytest.approx(0.4)
-    assert not reflex["stalled"]
     parts = reflex["reaction_ms"]
     assert parts["window"] == 120.0  # four windows of 30 ms
     assert 0.0 <= parts["sensor"] < 60.0
@@ -319,24 +285,20 @@ def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(
     rig = rigs[0]
     rig.connect()
     rig.begin_trial(order.plan.program(order.trial).home, 1)  # type: ignore[union-attr, arg-type]
-    assert rig.gripper is not None
     assert rig.gripper.state().opening_mm == pytest.approx(40.0)
 
 
-def test_a_grip_stalls_at_the_force_of_the_rig_file(
-    model: Path, protocol: Path, tmp_path: Path
-) -> None:
+def test_a_grip_stalls_at_the_force_of_the_rig_file(gripping: Gripping) -> None:
     weak = {"mock": {"gripper": {"force_n": [2.0, 50.0]}}, "reflex": {"force": "2 N"}}
-    order = gripping(model, protocol, tmp_path, weak, "grip:1")
+    order = gripping("grip:1", **weak)
     reflex = detect(order, counting=slip_when_busy())["reflex"]
-    assert reflex
     assert reflex["stalled"]
     assert 0.0 < reflex["closed_mm"] < 0.5
 
 
-def test_a_grip_ends_at_the_deepest_place(model: Path, protocol: Path, tmp_path: Path) -> None:
+def test_a_grip_ends_at_the_deepest_place(gripping: Gripping) -> None:
     with pytest.raises(InputError, match=r"3\.7 mm; the protocol's limits.depth is 3\.6 mm"):
-        gripping(model, protocol, tmp_path, reflex="grip:1.3")
+        gripping("grip:1.3")
 
 
 @pytest.mark.parametrize(
@@ -364,14 +326,12 @@ def test_a_loopback_rig_needs_the_fingers_that_its_gripper_moves(tmp_path: Path)
         with pytest.raises(InputError, match=r"mock.gripper.opening_mm.* must be 40: the fake of"):
             load_rig_file(write(tmp_path / "rig.yaml", change))
     allowed = load_rig_file(shipped)[0].gripper_range
-    assert allowed is not None
     assert allowed.force_n == (20.0, 235.0)
 
 
-def test_limits_of_force_hold_for_grips(model: Path, protocol: Path, tmp_path: Path) -> None:
-    change = {"mock": {"force": {}}, "limits": {"force": "10 N"}}
+def test_limits_of_force_hold_for_grips(gripping: Gripping) -> None:
     with pytest.raises(InputError, match=r"limits.force is 10 N: set reflex.force to less"):
-        gripping(model, protocol, tmp_path, change)
+        gripping(mock={"force": {}}, limits={"force": "10 N"})
 
 
 # -- the network's process -------------------------------------------------------------------

@@ -82,7 +82,6 @@ def cluster(address: str) -> Iterator[Cluster]:
     with distributed.Client(address, timeout="30s") as client:
         client.wait_for_workers(2, timeout=60)
     with connected(address) as found:
-        assert found is not None
         assert found.cores == 2
         yield found
 
@@ -225,7 +224,6 @@ def test_the_commands_of_the_docs_listen_on_this_computer_only(page: str) -> Non
     try:
         for kind in ("scheduler", "worker"):
             found = re.search(rf"^(?:\$ )?dask {kind} .*$", text, re.M)
-            assert found is not None
             line = found[0].removeprefix("$ ").replace("8786", port).replace("8787", "0")
             line = re.sub(r"--nworkers \d+", "--nworkers 1", line)
             command = [sys.executable, "-m", "distributed.cli.dask_" + kind]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -21,8 +20,10 @@ from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from tests.command_line import SLIPLAB, answer, here
 from tests.conftest import ROOT
+from tests.flows.programs import ended, environment
 
 ODD = "lab.db?new #2 50%41 'q' [x]:\n"
+SOCKS = {"ALL_PROXY": "socks5://127.0.0.1:9"}
 BYTES = os.fsdecode(b"Gr\xf6\xdfe")
 """A Latin-1 name."""
 
@@ -90,13 +91,13 @@ def test_client_that_cannot_be_made_is_an_error(
         monkeypatch.setattr("prefect.flow_engine.run_flow", fail)
     monkeypatch.setattr(orchestration, "_lost_servers", set())
     done: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        if unreachable:
+    if not unreachable:
+        assert run(counted, Opaque(done)) == 1
+    else:
+        with monkeypatch.context() as patch:
             patch.setattr("prefect.context.get_client", fail)
             with pytest.raises(ImportError, match="no SOCKS"):
                 run(counted, Opaque(done))
-        else:
-            assert run(counted, Opaque(done)) == 1
     assert len(done) == (0 if unreachable else 1)
 
 
@@ -135,20 +136,13 @@ def test_unusable_connection_setting_is_named(
     assert "secret-word" not in error.value.message
 
 
-@pytest.mark.parametrize(
-    ("variable", "value"),
-    [
-        ("ALL_PROXY", "socks5://127.0.0.1:9"),
-        ("ALL_PROXY", ""),
-        ("HTTPS_PROXY", "http://127.0.0.1:9"),
-        ("NO_PROXY", "*"),
-    ],
-)
-def test_usable_connection_setting_is_accepted(
-    variable: str, value: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(variable, value)
-    orchestration.check_connections()
+def test_usable_connection_setting_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    proxy = "http://127.0.0.1:9"
+    for setting in ({"ALL_PROXY": ""}, {"HTTPS_PROXY": proxy}, {"NO_PROXY": "*"}, SOCKS):
+        with monkeypatch.context() as patch:
+            for variable, value in setting.items():
+                patch.setenv(variable, value)
+            orchestration.check_connections()
 
 
 def test_server_with_an_invalid_address_has_a_name() -> None:
@@ -188,7 +182,7 @@ def test_text_that_is_not_utf_8_is_one_line_where_it_cannot_be_kept(tmp_path: Pa
 @pytest.mark.parametrize(
     ("change", "code", "said"),
     [
-        ({"ALL_PROXY": "socks5://127.0.0.1:9"}, 0, ""),
+        (SOCKS, 0, ""),
         ({"ALL_PROXY": "socks4://127.0.0.1:9"}, 2, "environment: ALL_PROXY: cannot be used"),
         ({"PREFECT_API_REQUEST_TIMEOUT": "abc"}, 2, "Prefect's settings cannot be read: "),
         ({"PREFECT_HOME": "/proc/none"}, 0, "cannot be written"),
@@ -199,29 +193,11 @@ def test_command_in_an_odd_environment(
     change: dict[str, str], code: int, said: str, tmp_path: Path
 ) -> None:
     store = tmp_path / "Größe?"
-    environment = {**os.environ, **change}
-    if "PREFECT_HOME" not in change:
-        environment.pop("PREFECT_HOME")
-    done = subprocess.run(
-        [
-            *SLIPLAB,
-            "collect",
-            "pilot",
-            "--rig",
-            "rehearsal",
-            "--trials",
-            "1",
-            "--store",
-            str(store),
-            "--operator",
-            "Zoë 木村",
-            "--json",
-        ],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        timeout=240,
-        check=False,
+    command = (*SLIPLAB, "collect", "pilot", "--rig", "rehearsal", "--trials", 1, "--json")
+    done = ended(
+        [*command, "--store", store, "--operator", "Zoë 木村"],
+        env=environment(**change),
+        text=False,
     )
     text = done.stderr.decode()
     assert done.returncode == code, text
@@ -247,16 +223,8 @@ print(len(list(store)))
 @pytest.mark.programs
 def test_label_in_a_script_without_a_guard_collects_once(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "store")],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    command = (sys.executable, tmp_path / "script.py", tmp_path / "store")
+    done = ended(command, 300, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["1"]
     (campaign,) = Store.open(tmp_path / "store").campaigns()

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,8 +21,9 @@ from sliplab.flows.running import parallel_map
 from sliplab.flows.running.parallel_map import WorkerKilled
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
-from tests.conftest import ROOT
+from tests.command_line import SLIPLAB
 from tests.flows.conftest import six_trials
+from tests.flows.programs import ended, running
 from tests.flows.server.serving import until
 
 pytestmark = pytest.mark.programs
@@ -48,8 +47,6 @@ def test_every_step_goes_on_after_it_was_killed(
     seed: int, steps: Sequence[str], taken: Path, tmp_path: Path
 ) -> None:
     """Each is killed with all its processes once it has written a random number of files."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    environment.pop("PREFECT_HOME", None)
     folder = shutil.copytree(taken, tmp_path / "store")
     runs = folder / "control" / "runs"
     random = Random(seed)
@@ -68,39 +65,20 @@ def test_every_step_goes_on_after_it_was_killed(
         return found
 
     for step in steps:
-        command = [sys.executable, "-m", "sliplab", step, str(folder), "--json"]
+        command = [*SLIPLAB, step, folder, "--json"]
         runs_before, results_before = begun(), results()
         wanted = random.randrange(FILES[step])
-        process = subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env=environment,
-            start_new_session=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        with running(command, tmp_path / "messages") as process:
 
-        def far_enough() -> bool:
-            if process.poll() is not None:  # noqa: B023
-                return True
-            return bool(begun() - runs_before) and len(results() - results_before) >= wanted  # noqa: B023
+            def far_enough() -> bool:
+                if process.poll() is not None:
+                    return True
+                return bool(begun() - runs_before) and len(results() - results_before) >= wanted  # noqa: B023
 
-        try:
             until(f"{step} has written {wanted} files", far_enough)
-        finally:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait(60)
         assert process.returncode == -signal.SIGKILL, f"{step} was over before {wanted} files"
         (killed,) = begun() - runs_before
-        done = subprocess.run(
-            command,
-            cwd=ROOT,
-            env=environment,
-            text=True,
-            capture_output=True,
-            timeout=240,
-            check=False,
-        )
+        done = ended(command)
         assert done.returncode == 0, done.stderr
         assert "Prefect server" not in done.stderr
         made = json.loads(done.stdout)

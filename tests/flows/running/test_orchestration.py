@@ -112,7 +112,6 @@ def test_a_new_file_begins_as_a_copy_only_of_one_that_is_sound(
     monkeypatch.setattr(embedded_server, "_make", make)
     (tmp_path / "home").mkdir()
     template = embedded_server._template()
-    assert template is not None
     template.parent.mkdir(parents=True)
     if kept == "damaged":
         template.write_bytes(b"not a database at all" * 1000)

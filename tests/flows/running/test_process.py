@@ -16,6 +16,7 @@ import pytest
 from sliplab.flows.running import process
 from sliplab.flows.running.process import OutputLost
 from tests.conftest import ROOT
+from tests.flows.programs import ended
 
 pytestmark = pytest.mark.programs
 
@@ -28,14 +29,7 @@ LOST = "error: the result cannot be written to standard output: "
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
     """Run a line of bash whose last command's exit code is the line's."""
-    return subprocess.run(
-        ["bash", "-c", line],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        stdin=subprocess.DEVNULL,
-    )
+    return ended(["bash", "-c", line], stdin=subprocess.DEVNULL)
 
 
 @pytest.mark.parametrize(

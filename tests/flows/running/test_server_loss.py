@@ -15,15 +15,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sliplab.flows.running.embedded_server import EmbeddedServer
-from tests.conftest import ROOT
+from tests.command_line import SLIPLAB
 from tests.flows.conftest import tiny, write
+from tests.flows.programs import ended, environment, running
 from tests.flows.server.serving import until
 
 pytestmark = pytest.mark.programs
@@ -38,24 +39,9 @@ LOST = "Prefect server"
 class Collection:
     """`sliplab collect` in a process of its own, as a terminal runs it."""
 
-    def __init__(self, folder: Path, **environment: str) -> None:
+    def __init__(self, folder: Path, process: subprocess.Popen[str], env: dict[str, str]) -> None:
         self.store, self.log = folder / "store", folder / "messages"
-        self._environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
-        if "PREFECT_HOME" not in environment:
-            self._environment.pop("PREFECT_HOME", None)
-        protocol = write(folder / "p.yaml", tiny())
-        with self.log.open("w") as messages:
-            self.process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "sliplab", "collect", str(protocol)),
-                    *("--rig", "rehearsal", "--store", str(self.store), "--json"),
-                ],
-                cwd=ROOT,
-                env=self._environment,
-                start_new_session=True,
-                stdout=subprocess.DEVNULL,
-                stderr=messages,
-            )
+        self.process, self._environment = process, env
 
     @property
     def committed(self) -> int:
@@ -92,29 +78,19 @@ class Collection:
 
     def label(self) -> str:
         """Run the next command; returns its messages."""
-        done = subprocess.run(
-            [sys.executable, "-m", "sliplab", "label", str(self.store)],
-            cwd=ROOT,
-            env=self._environment,
-            text=True,
-            capture_output=True,
-            timeout=120,
-            check=True,
-        )
+        done = ended([*SLIPLAB, "label", self.store], 120, env=self._environment)
+        assert done.returncode == 0, done.stderr
         return done.stderr
 
 
 @contextmanager
-def collecting(folder: Path, **environment: str) -> Iterator[Collection]:
+def collecting(folder: Path, **changes: str) -> Iterator[Collection]:
     """One collection; nothing of it is left when the block ends."""
     folder.mkdir(exist_ok=True)
-    running = Collection(folder, **environment)
-    try:
-        yield running
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(running.process.pid, signal.SIGKILL)
-        running.process.wait(60)
+    command = ("collect", write(folder / "p.yaml", tiny()), "--store", folder / "store", "--json")
+    env = environment(**changes)
+    with running([*SLIPLAB, *command, "--rig", "rehearsal"], folder / "messages", env) as process:
+        yield Collection(folder, process, env)
 
 
 def states(database: Path) -> list[tuple[str, str]]:
@@ -140,46 +116,45 @@ def fill(server: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "lose",
-    [die, *(pytest.param(how, marks=pytest.mark.long) for how in (stand_still, fill))],
+    "lose", [die, *(pytest.param(how, marks=pytest.mark.long) for how in (stand_still, fill))]
 )
 def test_a_campaign_goes_on_without_its_server(lose: Callable[[int], None], tmp_path: Path) -> None:
-    with collecting(tmp_path) as running:
-        running.begun()
-        lose(running.server)
-        assert running.ends() == 0, running.log.read_text()
-        assert running.committed == 6
-        assert len(running.lines()) == 1, running.log.read_text()
-        assert "Traceback" not in (log := running.log.read_text()), log
-        said = running.label()
+    with collecting(tmp_path) as run:
+        run.begun()
+        lose(run.server)
+        assert run.ends() == 0, run.log.read_text()
+        assert run.committed == 6
+        assert len(run.lines()) == 1, run.log.read_text()
+        assert "Traceback" not in (log := run.log.read_text()), log
+        said = run.label()
         assert LOST not in said
-    database = running.store / ".prefect" / "prefect.db"
+    database = run.store / ".prefect" / "prefect.db"
     assert ("collect", "COMPLETED") in states(database)
     assert all(state == "COMPLETED" for _, state in states(database))
 
 
 @pytest.mark.long
 def test_ctrl_c_acts_while_the_server_stands_still(tmp_path: Path) -> None:
-    with collecting(tmp_path) as running:
-        running.begun()
-        stand_still(running.server)
-        running.process.send_signal(signal.SIGINT)
-        assert running.ends(STOP_S) == 130, running.log.read_text()
-        assert "every committed trial is kept" in running.log.read_text()
-        assert running.committed < 6
-        running.label()
-    known = dict(states(running.store / ".prefect" / "prefect.db"))
+    with collecting(tmp_path) as run:
+        run.begun()
+        stand_still(run.server)
+        run.process.send_signal(signal.SIGINT)
+        assert run.ends(STOP_S) == 130, run.log.read_text()
+        assert "every committed trial is kept" in run.log.read_text()
+        assert run.committed < 6
+        run.label()
+    known = dict(states(run.store / ".prefect" / "prefect.db"))
     assert known["collect"] == "CRASHED"
 
 
 @pytest.mark.long  # the test before is of the same, while a trial is taken
 def test_ctrl_c_acts_while_the_end_is_reported(tmp_path: Path) -> None:
-    with collecting(tmp_path) as running:
-        running.begun()
-        stand_still(running.server)
-        until("all trials", lambda: running.committed == 6 or running.process.poll() is not None)
-        running.process.send_signal(signal.SIGINT)
-        assert running.ends(STOP_S) in {0, 130}, running.log.read_text()
+    with collecting(tmp_path) as run:
+        run.begun()
+        stand_still(run.server)
+        until("all trials", lambda: run.committed == 6 or run.process.poll() is not None)
+        run.process.send_signal(signal.SIGINT)
+        assert run.ends(STOP_S) in {0, 130}, run.log.read_text()
 
 
 @contextmanager
@@ -199,18 +174,16 @@ def test_a_named_server_that_stands_still_is_reported_to_again(tmp_path: Path) -
     with (
         users_server(tmp_path / "home") as server,
         collecting(
-            tmp_path / "work",
-            PREFECT_API_URL=server.url,
-            PREFECT_API_AUTH_STRING=server.password,
-        ) as running,
+            tmp_path / "work", PREFECT_API_URL=server.url, PREFECT_API_AUTH_STRING=server.password
+        ) as run,
     ):
-        running.begun()
+        run.begun()
         stand_still(server.pid)
-        assert running.ends() == 0, running.log.read_text()
-        assert running.committed == 6
-        assert len(running.lines()) == 1
+        assert run.ends() == 0, run.log.read_text()
+        assert run.committed == 6
+        assert len(run.lines()) == 1
         os.kill(server.pid, signal.SIGCONT)
-        assert LOST not in running.label()
+        assert LOST not in run.label()
         assert all(state == "COMPLETED" for _, state in states(tmp_path / "home" / "prefect.db"))
 
 
@@ -218,10 +191,10 @@ def test_a_named_server_that_is_not_there_is_said(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{free.getsockname()[1]}/api"
-    with collecting(tmp_path, PREFECT_API_URL=url) as running:
-        assert running.ends(120) == 0, running.log.read_text()
-        assert running.committed == 6
-        (line,) = running.lines()
+    with collecting(tmp_path, PREFECT_API_URL=url) as run:
+        assert run.ends(120) == 0, run.log.read_text()
+        assert run.committed == 6
+        (line,) = run.lines()
         assert url.removesuffix("/api") in line
         assert "refused" in line
 
@@ -230,10 +203,10 @@ def test_a_server_that_cannot_start_is_said_with_its_cause(tmp_path: Path) -> No
     home = tmp_path / "home"
     home.mkdir()
     (home / "prefect.db").write_bytes(b"is no database" * 1000)
-    with collecting(tmp_path / "work", PREFECT_HOME=str(home)) as running:
-        assert running.ends(120) == 0, running.log.read_text()
-        assert running.committed == 6
-        (line,) = running.lines()
+    with collecting(tmp_path / "work", PREFECT_HOME=str(home)) as run:
+        assert run.ends(120) == 0, run.log.read_text()
+        assert run.committed == 6
+        (line,) = run.lines()
         assert "file is not a database" in line
         assert str(home / "server.log") in line
 
@@ -242,12 +215,12 @@ def test_a_proxy_is_not_asked_for_the_loopback(tmp_path: Path) -> None:
     dead = "http://127.0.0.1:9"
     proxies: dict[str, Any] = dict.fromkeys(("http_proxy", "https_proxy", "all_proxy"), dead)
     proxies |= {name.upper(): value for name, value in proxies.items()}
-    with collecting(tmp_path, **proxies, no_proxy="", NO_PROXY="") as running:
-        assert running.ends(120) == 0, running.log.read_text()
-        assert running.lines() == []
-        assert states(running.store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
+    with collecting(tmp_path, **proxies, no_proxy="", NO_PROXY="") as run:
+        assert run.ends(120) == 0, run.log.read_text()
+        assert run.lines() == []
+        assert states(run.store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
         tasks = "select count(*) from task_run where state_type = 'COMPLETED'"
-        path = running.store / ".prefect" / "prefect.db"
+        path = run.store / ".prefect" / "prefect.db"
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as file:
             assert file.execute(tasks).fetchone()[0] >= 1  # a slow machine needs several
 
@@ -260,18 +233,8 @@ def test_closed_standard_streams_do_not_matter(closed: str, tmp_path: Path) -> N
     """A service manager may start a program without any of them."""
     protocol = write(tmp_path / "p.yaml", tiny())
     command = f"{sys.executable} -m flows collect {protocol} --rig rehearsal --trials 1"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    environment.pop("PREFECT_HOME", None)
     store = tmp_path / "store"
-    done = subprocess.run(
-        ["/bin/sh", "-c", f"exec {command} --store {store} {closed}"],
-        cwd=ROOT,
-        env=environment,
-        text=True,
-        stderr=subprocess.PIPE,
-        timeout=120,
-        check=False,
-    )
+    done = ended(["/bin/sh", "-c", f"exec {command} --store {store} {closed}"], 120)
     # the result has nowhere to go where standard output is closed, which is said as a failure
     assert done.returncode == (1 if ">&-" in closed else 0), done.stderr
     assert LOST not in done.stderr
@@ -283,16 +246,8 @@ def test_a_limit_on_the_size_of_files_is_named(tmp_path: Path) -> None:
     began = time.monotonic()
     protocol = write(tmp_path / "p.yaml", tiny())
     command = f"{sys.executable} -m flows collect {protocol} --rig rehearsal --trials 1"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "none")}
-    environment.pop("PREFECT_HOME", None)
-    done = subprocess.run(
-        ["/bin/sh", "-c", f"ulimit -f 100; exec {command} --store {tmp_path / 'store'}"],
-        cwd=ROOT,
-        env=environment,
-        text=True,
-        stderr=subprocess.PIPE,
-        timeout=120,
-        check=False,
-    )
+    line = f"ulimit -f 100; exec {command} --store {tmp_path / 'store'}"
+    env = environment(XDG_CACHE_HOME=str(tmp_path / "none"))
+    done = ended(["/bin/sh", "-c", line], 120, env=env)
     assert "file size limit" in done.stderr, done.stderr
     assert time.monotonic() - began < 110

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -53,9 +52,8 @@ def server() -> Iterator[EmbeddedServer]:
 def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
     """This process as the one that serves a store that is not there yet."""
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
-    monkeypatch.setattr(
-        orchestration, "uses_private_server", lambda: False
-    )  # as if somebody could look
+    # as if somebody could look
+    monkeypatch.setattr(orchestration, "uses_private_server", lambda: False)
     store = Store.create(tmp_path / "store")
     here = str(tmp_path)
     found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid(), (here,))
@@ -151,18 +149,16 @@ def test_a_run_reads_no_file_outside_the_services_folders(
     (folder / "link.yaml").symlink_to(elsewhere)
     (folder / "folder").symlink_to(elsewhere.parent)
     (folder / "key.pem").write_text(SECRET)
-    for given in (
-        "/proc/self/environ",
-        "/etc/shadow",
-        str(elsewhere),
+    inside = (
         "../elsewhere0/protocol.yaml",
         "link.yaml",
         "folder/protocol.yaml",
         "key.pem",
         "",
         "/",
-        str(elsewhere.with_name("missing.yaml")),
-    ):
+    )
+    missing = elsewhere.with_name("missing.yaml")
+    for given in ("/proc/self/environ", "/etc/shadow", elsewhere, missing, *inside):
         with pytest.raises(InputError, match=r"must be a file .yaml or .yml below ") as error:
             service.protocol(Path(given))
         assert SECRET not in str(error.value)
@@ -170,9 +166,8 @@ def test_a_run_reads_no_file_outside_the_services_folders(
     assert service.protocol(protocol) == protocol.resolve()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_nothing_is_quoted_of_what_is_no_protocol(service: Service, tmp_path: Path) -> None:
+    for text in (
         f"password: {SECRET}\n",
         SECRET,
         f"a: *{SECRET}\n",
@@ -180,22 +175,17 @@ def test_a_run_reads_no_file_outside_the_services_folders(
         f"!{SECRET} x\n",
         f"? {{{SECRET}: 1}}\n: 2\n",
         f"protocol_of: {SECRET}\n",
-    ],
-)
-def test_nothing_is_quoted_of_what_is_no_protocol(
-    service: Service, tmp_path: Path, text: str
-) -> None:
-    (tmp_path / "settings.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"settings\.yaml: is not a valid protocol") as error:
-        service.protocol(Path("settings.yaml"))
-    assert SECRET not in str(error.value)
+    ):
+        (tmp_path / "settings.yaml").write_text(text)
+        with pytest.raises(InputError, match=r"settings\.yaml: is not a valid protocol") as error:
+            service.protocol(Path("settings.yaml"))
+        assert SECRET not in str(error.value)
 
 
 def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protocol: Path) -> None:
     from sliplab.flows.server.deployments import collect
 
-    with ExitStack() as stack:
-        stack.enter_context(exclusive(service.folder / ".lock", "the store"))
+    with exclusive(service.folder / ".lock", "the store"):
         state = collect(Collect(protocol=protocol, patience_min=0), return_state=True)
     assert (state.type.value, "is in use by another program" in state.message) == ("FAILED", True)
 
@@ -231,7 +221,6 @@ def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -
     assert until_of(OnRig(), Run()) is None
     Run.expected_start_time = datetime.now(UTC)
     end = until_of(OnRig(until="06:00", timezone="UTC"), Run())
-    assert end is not None
     assert 0 < end - Run.expected_start_time.timestamp() <= 86400
 
 
@@ -279,18 +268,15 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
 ) -> None:
     from sliplab.flows.server.deployments import collect
 
-    when = serve._prefects(
-        [
-            Scheduled(
-                name="nights",
-                flow="collect",
-                cron="0 22 * * *",
-                timezone="Europe/Rome",
-                active=True,
-                parameters={"protocol": "p.yaml", "until": "06:00"},
-            )
-        ]
+    night = Scheduled(
+        name="nights",
+        flow="collect",
+        cron="0 22 * * *",
+        timezone="Europe/Rome",
+        active=True,
+        parameters={"protocol": "p.yaml", "until": "06:00"},
     )
+    when = serve._prefects([night])
     store = Store.open(service.folder)
 
     async def register() -> None:
@@ -312,14 +298,8 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
 
     there = page.deployment("collect")
     assert page.call(f"/deployments/{there['id']}/schedule", {}) is None
-    runs = page.call(
-        "/flow_runs/filter",
-        {
-            "flow_runs": {"deployment_id": {"any_": [there["id"]]}},
-            "sort": "EXPECTED_START_TIME_ASC",
-        },
-    )
-    assert runs
+    asked = {"flow_runs": {"deployment_id": {"any_": [there["id"]]}}}
+    runs = page.call("/flow_runs/filter", asked | {"sort": "EXPECTED_START_TIME_ASC"})
     assert runs[0]["auto_scheduled"]
     assert runs[0]["parameters"] == {"wanted": {"protocol": "p.yaml", "until": "06:00"}}
 

@@ -54,16 +54,10 @@ class Service:
 
     def handshake(self, path: str, **headers: str) -> int:
         """The status that answers a websocket's first request."""
-        return self.ask(
-            "GET",
-            path,
-            Upgrade="websocket",
-            Connection="Upgrade",
-            Sec_WebSocket_Version="13",
-            Sec_WebSocket_Key=base64.b64encode(b"0" * 16).decode(),
-            Sec_WebSocket_Protocol="prefect",
-            **headers,
-        )[0]
+        sent = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
+        key = base64.b64encode(b"0" * 16).decode()
+        sent |= {"Sec_WebSocket_Key": key, "Sec_WebSocket_Protocol": "prefect"}
+        return self.ask("GET", path, **sent, **headers)[0]
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +75,9 @@ def basic(password: str) -> str:
 
 
 def test_a_foreign_page_gets_no_leave_to_ask(service: Service) -> None:
-    status, headers, _ = service.ask(
-        "OPTIONS",
-        "/api/deployments/filter",
-        Origin=EVIL,
-        Access_Control_Request_Method="POST",
-        Access_Control_Request_Headers="content-type",
-    )
+    asked = {"Method": "POST", "Headers": "content-type"}
+    asked = {f"Access_Control_Request_{name}": value for name, value in asked.items()}
+    status, headers, _ = service.ask("OPTIONS", "/api/deployments/filter", Origin=EVIL, **asked)
     assert (status, headers.get("access-control-allow-origin")) == (403, None)
 
 
@@ -102,11 +92,9 @@ def test_a_foreign_page_is_answered_nothing(service: Service, origin: str, kind:
             "POST", path, body, Origin=origin, Content_Type=kind, Authorization=known
         )
         assert (status, headers.get("access-control-allow-origin")) == (403, None), text
+    path, sent = f"/api/deployments/{deployment}", {"Origin": origin, "Authorization": known}
     for method in ("GET", "PATCH", "DELETE"):
-        found = service.ask(
-            method, f"/api/deployments/{deployment}", Origin=origin, Authorization=known
-        )
-        assert found[0] == 403
+        assert service.ask(method, path, **sent)[0] == 403
     assert service.page.call("/flow_runs/filter", {}) == []  # nothing was started
     assert service.page.deployment("collect")["id"] == deployment
 

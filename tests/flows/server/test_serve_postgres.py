@@ -62,19 +62,8 @@ def database(password: str) -> Iterator[str]:
         assert done.returncode == 0, done.stderr
 
     try:
-        call(
-            str(BIN / "initdb"),
-            "-D",
-            data,
-            "-U",
-            "prefect",
-            "-A",
-            "scram-sha-256",
-            "--pwfile",
-            str(secret),
-            "--no-sync",
-            "--locale=C.UTF-8",
-        )
+        login = ("-U", "prefect", "-A", "scram-sha-256", "--pwfile", str(secret))
+        call(str(BIN / "initdb"), "-D", data, *login, "--no-sync", "--locale=C.UTF-8")
         options += f" -c unix_socket_directories={folder}"
         log = str(folder / "log")
         call(control_program, "start", "-w", "-s", "-D", data, "-l", log, "-o", options)

@@ -85,14 +85,8 @@ def test_the_list_follows_the_store(made: Reviewable) -> None:
 
 
 def test_doubts_are_told_once_and_gravest_first() -> None:
-    data = {
-        "incipient_ns": None,
-        "gross_ns": None,
-        "end_ns": 1,
-        "markers_lost": 2,
-        "plate_lost": 1,
-        "doubts": {"incipient": None, "gross": "hidden"},
-    }
+    data = {"incipient_ns": None, "gross_ns": None, "end_ns": 1, "markers_lost": 2}
+    data |= {"plate_lost": 1, "doubts": {"incipient": None, "gross": "hidden"}}
     assert [text for _, text in reasons_for_doubt(TrialLabel.model_validate(data))] == [
         "gross: hidden",
         "no slip was found",
@@ -112,7 +106,6 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     assert shown.motion_s == (0.2, 0.6)
     assert shown.frame_at(0.2551) == 25
     picture = shown.picture(25)
-    assert picture is not None
     assert picture.shape == (120, 120)
     assert picture[60, 60] == 220
     shown.close()

@@ -51,7 +51,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         env={**os.environ, "PYTHONWARNINGS": "default"},
     )
     try:
-        assert process.stdout is not None
         reported = json.loads(process.stdout.readline())
         with launched() as browser:
             yield Served(made, reported, process, browser)
@@ -129,8 +128,7 @@ def opened(served: Served) -> Iterator[Tab]:
     page.on("pageerror", lambda error: amiss.append(str(error)))
     page.on("response", lambda r: amiss.append(f"{r.status} {r.url}") if r.status >= 400 else None)
     page.on(
-        "request",
-        lambda r: None if r.url.startswith("http://127.0.0.1:") else amiss.append(r.url),
+        "request", lambda r: None if r.url.startswith("http://127.0.0.1:") else amiss.append(r.url)
     )
     page.goto(served.reported["url"])
     found = Tab(page, amiss)
@@ -238,13 +236,11 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
     assert tab.page.title() == "SlipLab review"
 
     made = review.last(served.made.store, NAME, one)
-    assert made is not None
     assert (made.verdict, made.who, made.label) == ("adjust", "anna", served.made.keys[one])
     assert (made.old.incipient_ns, made.old.gross_ns) == (known["incipient_ns"], known["gross_ns"])
     assert made.new.incipient_ns == round(float(reported.removesuffix(" s")) * 1e9)
     assert made.new.gross_ns == known["gross_ns"]  # not moved: to the nanosecond
     made = review.last(served.made.store, NAME, two)
-    assert made is not None
     assert (made.verdict, made.new) == ("reject", review.Onsets())
 
 
@@ -257,18 +253,8 @@ def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: 
     # another program, between this reviewer's look and this reviewer's key
     known = label()
     onsets = review.Onsets(known["incipient_ns"], known["gross_ns"])
-    review.decide(
-        served.made.store,
-        NAME,
-        trial,
-        "reject",
-        label=served.made.keys[trial],
-        old=onsets,
-        new=review.Onsets(),
-        seen=0,
-        who="bert",
-        why="blurred",
-    )
+    known = {"label": served.made.keys[trial], "old": onsets, "new": review.Onsets(), "seen": 0}
+    review.decide(served.made.store, NAME, trial, "reject", **known, who="bert", why="blurred")
     tab.press("a")
     # either the page knew already, and this is a second decision, or it says so
     expect(tab.page.locator("table.past")).to_contain_text("bert")

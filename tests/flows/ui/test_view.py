@@ -21,18 +21,8 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import Onsets
-from tests.analysis.labels.reviewable import (
-    EVENTS,
-    FRAMES,
-    NAME,
-    Reviewable,
-    displacements,
-    events,
-    frame_times,
-    label,
-    pictures,
-    places,
-)
+from tests.analysis.labels import reviewable
+from tests.analysis.labels.reviewable import EVENTS, FRAMES, NAME, Reviewable, events, frame_times
 from tests.flows.listening import listening
 
 chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (sliplab[view])")
@@ -42,20 +32,11 @@ chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (slip
 def made(tmp_path_factory: pytest.TempPathFactory) -> Reviewable:
     """Two trials; the first is reviewed and evaluated."""
     found = Reviewable(tmp_path_factory.mktemp("view") / "s", 2)
-    trial, known = found.ids[0], label()
+    trial, known = found.ids[0], reviewable.label()
     old = Onsets(known["incipient_ns"], known["gross_ns"])
     new = Onsets(310_000_001, 450_000_002)
-    review.decide(
-        found.store,
-        NAME,
-        trial,
-        "adjust",
-        label=found.keys[trial],
-        old=old,
-        new=new,
-        seen=0,
-        who="anna",
-    )
+    known = {"label": found.keys[trial], "old": old, "new": new, "seen": 0, "who": "anna"}
+    review.decide(found.store, NAME, trial, "adjust", **known)
     counts = {"counts": np.arange(12).reshape(4, 3), "end_ns": np.array([5, 7, 9, 1 << 60])}
     Derived.of(found.store, "counts", NAME).write(trial, "k", {}, counts)
     return found
@@ -123,15 +104,15 @@ def test_frames_and_markers_stand_at_their_times(saved: tuple[Read, Any]) -> Non
     for index in (0, 31, FRAMES - 1):
         packed = np.asarray(cells[index][0], np.uint8)
         image = cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE)
-        assert np.abs(image.astype(int) - pictures()[index]).mean() < 3
+        assert np.abs(image.astype(int) - reviewable.pictures()[index]).mean() < 3
     times, cells = read["/camera/markers", "Points2D:positions"]
     assert times == frame_times().tolist()
-    assert np.array_equal(np.array(cells, np.float32), places())
+    assert np.array_equal(np.array(cells, np.float32), reviewable.places())
     _, numbers = read["/camera/markers", "Points2D:class_ids"]
     assert numbers[-1] == list(range(7))
     times, values = read.curve("/displacement/marker_2")
     assert times == frame_times().tolist()
-    assert values == pytest.approx(displacements()[:, 2], abs=1e-6)
+    assert values == pytest.approx(reviewable.displacements()[:, 2], abs=1e-6)
 
 
 def test_arm_and_pulses_stand_at_their_times(saved: tuple[Read, Any]) -> None:
@@ -150,7 +131,7 @@ def test_arm_and_pulses_stand_at_their_times(saved: tuple[Read, Any]) -> None:
 
 def test_onsets_of_label_review_and_truth_are_told_apart(saved: tuple[Read, Any]) -> None:
     read, counts = saved
-    known = label()
+    known = reviewable.label()
     for name, onsets in (
         ("label", (known["incipient_ns"], known["gross_ns"])),
         ("review", (310_000_001, 450_000_002)),
