@@ -30,7 +30,7 @@ from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.storage.kernels import njit
-from sliplab.storage.schema.trial import Clocks, Counts, Gate, StreamRecord
+from sliplab.storage.schema.trial import Gate, StreamCounts, StreamRecord, TrialClockMaps
 from sliplab.storage.streams import (
     EVENTS_KIND,
     F64,
@@ -84,9 +84,9 @@ class Motion:
 class Assessment:
     """Clock maps, gates and counts of one attempt; `streams` has the named ones."""
 
-    clocks: Clocks
+    clocks: TrialClockMaps
     gates: dict[str, Gate]
-    counts: Counts
+    counts: StreamCounts
     streams: dict[str, StreamRecord] = field(default_factory=dict)
 
     @property
@@ -200,7 +200,7 @@ def assess(
             named[name] = about.model_copy(update=rows)
         else:
             named[name] = _scalar_record(about, readings[name])
-    counts = Counts(
+    counts = StreamCounts(
         events=len(event_us),
         frames=len(streams.frame_ns),
         poses=len(streams.pose_ns),

@@ -27,7 +27,7 @@ from sliplab.storage.versions import FIGURES, installed_versions
 _NONE = "–"
 
 
-class Deviation(NamedTuple):
+class RegistrationDeviation(NamedTuple):
     """One difference between a registration and its campaign, as text."""
 
     what: str
@@ -48,7 +48,7 @@ def registered_plan(registration: Registration, path: Path) -> Plan:
 
 def protocol_deviations(
     registration: Registration, path: Path, plan: Plan, text: str
-) -> Iterator[Deviation]:
+) -> Iterator[RegistrationDeviation]:
     """Yield what another protocol has that the registered one has not, and the reverse.
 
     Args:
@@ -56,28 +56,28 @@ def protocol_deviations(
     """
     hashes = [_hash(hash_text(each)) for each in (registration.protocol.text, text)]
     if hashes[0] != hashes[1]:
-        yield Deviation("text of the protocol", *hashes)
+        yield RegistrationDeviation("text of the protocol", *hashes)
     before = registered_plan(registration, path)
     was, now = comparable_collection(before), comparable_collection(plan)
     was.pop("stopping", None)
     stopping = now.pop("stopping", None)
     for change in differences(was, now, "collection"):
-        yield Deviation(*change)
+        yield RegistrationDeviation(*change)
     yield from _claim_deviations(before, plan)
     old, new = (_without_claims(each) for each in (registration.stopping, stopping))
     for key, *values in differences(old, new, "collection.stopping"):
         name = "error level of claims: " if key.endswith(".error") else ""
-        yield Deviation(name + key, *values)
+        yield RegistrationDeviation(name + key, *values)
     analysis = plan.protocol.analysis.model_dump(mode="json")
     for change in differences(registration.analysis, analysis, "analysis"):
-        yield Deviation(*change)
+        yield RegistrationDeviation(*change)
 
 
 def _without_claims(stopping: Mapping[str, Any] | None) -> dict[str, Any]:
     return {key: value for key, value in (stopping or {}).items() if key != "claims"}
 
 
-def _claim_deviations(before: Plan, plan: Plan) -> Iterator[Deviation]:
+def _claim_deviations(before: Plan, plan: Plan) -> Iterator[RegistrationDeviation]:
     """Yield claims that were removed, changed or added."""
     removed, added = ([*_claims(each)] for each in (before, plan))
     for claim in [each for each in removed if each in added]:
@@ -87,12 +87,14 @@ def _claim_deviations(before: Plan, plan: Plan) -> Iterator[Deviation]:
         subject = (claim.figure, claim.of, claim.between)
         other = next((it for it in added if (it.figure, it.of, it.between) == subject), None)
         if other is None:
-            yield Deviation("claim removed", _claim_text(claim, before), _NONE)
+            yield RegistrationDeviation("claim removed", _claim_text(claim, before), _NONE)
         else:
             added.remove(other)
-            yield Deviation("claim changed", _claim_text(claim, before), _claim_text(other, plan))
+            yield RegistrationDeviation(
+                "claim changed", _claim_text(claim, before), _claim_text(other, plan)
+            )
     for claim in added:
-        yield Deviation("claim added", _NONE, _claim_text(claim, plan))
+        yield RegistrationDeviation("claim added", _NONE, _claim_text(claim, plan))
 
 
 def _claims(plan: Plan) -> tuple[Claim, ...]:
@@ -106,7 +108,7 @@ def _claim_text(claim: Claim, plan: Plan) -> str:
 
 def campaign_deviations(
     item: Collected, registration: Registration, path: Path
-) -> Iterator[Deviation]:
+) -> Iterator[RegistrationDeviation]:
     """Yield every difference of a campaign from a registration, in the order of the work.
 
     Raises:
@@ -125,15 +127,15 @@ def campaign_deviations(
     yield from _version_deviations(item, registration)
 
 
-def _changed(what: str, old: Iterable[str], new: Iterable[str]) -> Deviation:
-    return Deviation(what, ", ".join(old) or _NONE, ", ".join(new) or _NONE)
+def _changed(what: str, old: Iterable[str], new: Iterable[str]) -> RegistrationDeviation:
+    return RegistrationDeviation(what, ", ".join(old) or _NONE, ", ".join(new) or _NONE)
 
 
-def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+def _rig_deviations(item: Collected, registration: Registration) -> Iterator[RegistrationDeviation]:
     rig = registration.rig
     if rig is None or rig.sha256 == item.info.get("rig_hash"):
         return
-    yield Deviation(
+    yield RegistrationDeviation(
         "rig file",
         f"{rig.name}, {_hash(rig.sha256)}",
         f"{item.info.get('rig')}, {_hash(item.info.get('rig_hash'))}",
@@ -141,12 +143,12 @@ def _rig_deviations(item: Collected, registration: Registration) -> Iterator[Dev
     texts = (rig.text, read_text(item.campaign.folder / RIG, "rig file"))
     old, new = (without_secrets(parse_yaml(text, RIG)) for text in texts)
     for change in differences(old, new, "rig"):
-        yield Deviation(*change)
+        yield RegistrationDeviation(*change)
 
 
 def _trial_deviations(
     item: Collected, registration: Registration, plan: Plan
-) -> Iterator[Deviation]:
+) -> Iterator[RegistrationDeviation]:
     """Yield trials that were taken before, are missing, or were not registered."""
     began = datetime.fromisoformat(registration.registered)
     early = [
@@ -160,17 +162,17 @@ def _trial_deviations(
         found = f"registered {registration.after}"
         if early:
             found += f"; {_listed(early, 'trial')} began before that time"
-        yield Deviation("trials taken before the registration", _NONE, found)
+        yield RegistrationDeviation("trials taken before the registration", _NONE, found)
     planned, committed = {trial.id for trial in plan}, item.campaign.committed()
     more = sorted(committed - planned)
     if more:
-        yield Deviation(
+        yield RegistrationDeviation(
             "more trials than registered", plural(len(planned), "trial"), _listed(more, "other")
         )
     missing = len(planned - committed)
     if missing:
         end = CampaignEnd.of(item.campaign.folder)
-        yield Deviation(
+        yield RegistrationDeviation(
             "fewer trials than registered",
             plural(len(planned), "trial"),
             f"{len(planned) - missing}"
@@ -182,10 +184,10 @@ def _listed(names: Sequence[str], what: str) -> str:
     return f"{plural(len(names), what)}: {'; '.join(names)}"
 
 
-def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
+def _attempt_deviations(item: Collected) -> Iterator[RegistrationDeviation]:
     """Yield trials that were skipped, set aside or retaken, each with its cause."""
     for trial, by in sorted(skipped(item.campaign).items()):
-        yield Deviation("trial skipped", _NONE, f"{trial}: {_by(by)}")
+        yield RegistrationDeviation("trial skipped", _NONE, f"{trial}: {_by(by)}")
     kinds: dict[str, list[QuarantineEntry]] = {}
     for entry in item.campaign.quarantined():
         kinds.setdefault(str(entry["cause"]).partition(":")[0], []).append(entry)
@@ -193,18 +195,18 @@ def _attempt_deviations(item: Collected) -> Iterator[Deviation]:
         if kind == AGAIN:
             for entry in entries:
                 found = f"{entry['trial']}: {_by(entry.get('asked', {}))}"
-                yield Deviation("trial retaken on request", _NONE, found)
+                yield RegistrationDeviation("trial retaken on request", _NONE, found)
         else:
             counts = Counter(entry["trial"] for entry in entries)
             names = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]
             what = "failed a gate" if kind == "gate" else f"quarantined: {kind}"
-            yield Deviation(f"attempts {what}", _NONE, _listed(names, "trial"))
+            yield RegistrationDeviation(f"attempts {what}", _NONE, _listed(names, "trial"))
     committed = item.campaign.committed()
     retakes = item.plan.protocol.collection.gates.retakes
     failed = item.campaign.failed_attempts()
     aside = [name for name, n in failed.items() if n > retakes and name not in committed]
     if aside:
-        yield Deviation("trials set aside", _NONE, _listed(aside, "trial"))
+        yield RegistrationDeviation("trials set aside", _NONE, _listed(aside, "trial"))
 
 
 def _by(by: Mapping[str, Any]) -> str:
@@ -213,7 +215,9 @@ def _by(by: Mapping[str, Any]) -> str:
     return f"by {by.get('who') or 'unknown'}, {by.get('when') or 'at an unknown time'}{why}"
 
 
-def _stopping_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+def _stopping_deviations(
+    item: Collected, registration: Registration
+) -> Iterator[RegistrationDeviation]:
     """Yield sessions that overruled the claims, and another network that judged them."""
     sessions = []
     for file in sorted((item.campaign.folder / "bench").glob("*.json")):
@@ -226,13 +230,17 @@ def _stopping_deviations(item: Collected, registration: Registration) -> Iterato
     end = CampaignEnd.of(item.campaign.folder)
     if sessions or (end is not None and end.verdict == "overruled"):
         when = f"; sessions of {', '.join(sessions)}" if sessions else ""
-        yield Deviation("stopping overruled", _NONE, f"collected with --no-stopping{when}")
+        yield RegistrationDeviation(
+            "stopping overruled", _NONE, f"collected with --no-stopping{when}"
+        )
     if end is not None and end.model != registration.judging_model:
         models = (registration.judging_model, end.model)
-        yield Deviation("network that judges the claims", *map(_hash, models))
+        yield RegistrationDeviation("network that judges the claims", *map(_hash, models))
 
 
-def _version_deviations(item: Collected, registration: Registration) -> Iterator[Deviation]:
+def _version_deviations(
+    item: Collected, registration: Registration
+) -> Iterator[RegistrationDeviation]:
     """Yield packages of another version than registered, in trials and in this report."""
     found: dict[str, Counter[str]] = {}
     for _, recording in item.trials:
@@ -246,4 +254,4 @@ def _version_deviations(item: Collected, registration: Registration) -> Iterator
         if here.get(name, registered) != registered:
             words.append(f"{here[name]} in this report")
         if words:
-            yield Deviation(f"version of {name}", registered, "; ".join(words))
+            yield RegistrationDeviation(f"version of {name}", registered, "; ".join(words))

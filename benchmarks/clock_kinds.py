@@ -26,7 +26,7 @@ from statistics import median
 import numpy as np
 from scipy import special
 
-from benchmarks.clocks import DRIFT_PPM, Train, make_train
+from benchmarks.clocks import DRIFT_PPM, StampTrain, make_train
 from benchmarks.measure import SEED, Figures
 from sliplab.analysis.clocks.clocks import ClockRefused, fit_clock
 from sliplab.rigs.core.pulse_code import U8, code_bits
@@ -159,7 +159,7 @@ def tally(kind: str, trains: int, seed: int = SEED) -> Tally:
     return Tally(kind, errors, stated, anywhere, fit_ms)
 
 
-def faulty_train(rng: np.random.Generator, kind: str) -> Train:
+def faulty_train(rng: np.random.Generator, kind: str) -> StampTrain:
     """A train of `benchmarks.clocks` with one more fault."""
     if kind.startswith("other_trial"):
         return _other_trial(rng, code_bits if kind == "other_trial" else _old_code)
@@ -168,7 +168,7 @@ def faulty_train(rng: np.random.Generator, kind: str) -> Train:
     if missing is None:
         return made
     there = rng.random(made.reference.size) >= missing
-    return Train(made.device, made.reference[there], made.true, made.sent, made.tick_ns)
+    return StampTrain(made.device, made.reference[there], made.true, made.sent, made.tick_ns)
 
 
 def _clock(rng: np.random.Generator, kind: str, sent: F64, tick: int) -> F64:
@@ -194,11 +194,11 @@ def _clock(rng: np.random.Generator, kind: str, sent: F64, tick: int) -> F64:
     return shift
 
 
-def _other_trial(rng: np.random.Generator, code: Callable[[int, int], U8]) -> Train:
+def _other_trial(rng: np.random.Generator, code: Callable[[int, int], U8]) -> StampTrain:
     """Pulses that the device saw in one trial, with those that the box sent in another as long."""
     seconds, tick = float(rng.uniform(20, 60)), int(rng.choice([10, 20, 50])) * 1_000_000
     one, other = (make_train(rng, seconds=seconds, tick=tick, code=code) for _ in range(2))
-    return Train(one.device, other.reference, one.true, one.sent, tick)
+    return StampTrain(one.device, other.reference, one.true, one.sent, tick)
 
 
 def _old_code(seed: int, n: int) -> U8:

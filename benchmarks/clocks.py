@@ -40,7 +40,7 @@ DRIFT_PPM = 400.0
 
 
 @dataclass(frozen=True)
-class Train:
+class StampTrain:
     """Stamps of a device, reports of the box, and true times of pulses on the device's clock.
 
     Attributes:
@@ -110,7 +110,7 @@ def make_train(
     seconds: float | None = None,
     tick: int | None = None,
     code: Callable[[int, int], U8] = code_bits,
-) -> Train:
+) -> StampTrain:
     """A train with all its faults.
 
     Args:
@@ -134,10 +134,10 @@ def make_train(
     again = seen[rng.random(seen.size) < 0.05]
     stray = rng.integers(true[0], true[-1], int(0.05 * seen.size))
     seen = np.concatenate((seen, again + rng.integers(0, 100_000, again.size), stray))
-    return Train(np.sort(seen) // 1000 * 1000, sent + start, true, sent + start, tick)
+    return StampTrain(np.sort(seen) // 1000 * 1000, sent + start, true, sent + start, tick)
 
 
-def _hopeless(rng: np.random.Generator, made: Train) -> list[tuple[I64, I64]]:
+def _hopeless(rng: np.random.Generator, made: StampTrain) -> list[tuple[I64, I64]]:
     """Device and reference trains that do not belong together."""
     ticks = int((made.reference[-1] - made.reference[0]) // made.tick_ns)
     bits = code_bits(int(rng.integers(1, SEEDS)), 4 * ticks)
@@ -150,14 +150,14 @@ def _hopeless(rng: np.random.Generator, made: Train) -> list[tuple[I64, I64]]:
     return [(one, other), (regular + 7, regular), (jumped, made.reference)]
 
 
-def _by_ours(made: Train) -> ClockFit | None:
+def _by_ours(made: StampTrain) -> ClockFit | None:
     try:
         return fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
     except ClockRefused:
         return None
 
 
-def by_index(made: Train) -> Line:
+def by_index(made: StampTrain) -> Line:
     """The first pulse belongs to the first, the second to the second; least squares."""
     count = min(made.device.size, made.reference.size)
     origin = int(made.device[0])
@@ -167,7 +167,7 @@ def by_index(made: Train) -> Line:
     return _line(origin, float(drift), float(level))
 
 
-def by_nearest(made: Train) -> Line:
+def by_nearest(made: StampTrain) -> Line:
     """The best lag of both trains in bins of a tenth of a tick, nearest neighbours, soft L1."""
     width = made.tick_ns // 10
     origin = int(made.device[0])
@@ -195,7 +195,7 @@ def by_nearest(made: Train) -> Line:
     return _line(origin, float(found.x[0]) * 1e-6, float(found.x[1]) * 1e3)
 
 
-def by_pyxdf(made: Train, fit: ClockFit) -> Line:
+def by_pyxdf(made: StampTrain, fit: ClockFit) -> Line:
     """pyxdf's regression on the pairs that ours found, late ones too; times in seconds as there."""
     mapped = fit.map.to_reference(made.device)
     nearest = np.clip(np.searchsorted(made.reference, mapped), 1, made.reference.size - 1)

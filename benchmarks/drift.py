@@ -21,7 +21,7 @@ from sliplab.plugins.twin.drift.estimates import drifts
 from sliplab.plugins.twin.drift.flow import OneSpecimen
 from sliplab.plugins.twin.parameters import drawn
 from sliplab.plugins.twin.statistics import of_names
-from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_specimen, simulated
+from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_specimen, simulated
 from sliplab.protocols import load_plan
 from sliplab.protocols.shipped import shipped_protocols
 from sliplab.rigs.rig_file import load_rig_file
@@ -70,7 +70,7 @@ def main() -> None:
         for trial, share in zip(trials, along, strict=True):
             now = {**values, FRICTION: values[FRICTION] * fall**share}
             made = other_specimen(rig, now, specimen, float(rng.uniform(-ZERO_MM, ZERO_MM)))
-            world = World(
+            world = DrawnWorld(
                 made, Slides(plan, (trial,), frozenset({trial.id})), number, guess_of(rig)
             )
             observed.append(of_names(world.statistics().fitted, bank.statistics))

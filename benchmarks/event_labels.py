@@ -36,7 +36,7 @@ WRONG_MS = 150.0
 """Half of the widest 95 % interval of an onset that is not in doubt."""
 
 
-class Changed:
+class ChangedRecording:
     """A recording whose events come out of a function of them and of a time, microseconds."""
 
     def __init__(self, recording: Recording, change: Change, about: str) -> None:
@@ -145,7 +145,7 @@ CASES: dict[str, tuple[str, Change]] = {
 
 
 @dataclass
-class Found:
+class OnsetErrors:
     """Onsets of many trials: errors and intervals of the known ones, and how many are in doubt."""
 
     errors_ms: dict[str, list[float]] = field(default_factory=lambda: {k: [] for k in KINDS})
@@ -197,13 +197,16 @@ def main(trials: int = 72) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plain = take(Path(folder) / "plain", trials)
         print(HEAD)
-        by_speed: dict[str, Found] = {}
-        total = Found()
+        by_speed: dict[str, OnsetErrors] = {}
+        total = OnsetErrors()
         for recording in plain:
             begun = time.process_time()
             found = onsets_by_events(recording, Labelling())
             total.seconds += time.process_time() - begun
-            for each in (by_speed.setdefault(recording.record.condition["speed"], Found()), total):
+            for each in (
+                by_speed.setdefault(recording.record.condition["speed"], OnsetErrors()),
+                total,
+            ):
                 each.add(found, recording)
         for speed in sorted(by_speed):
             print(by_speed[speed].row(speed))
@@ -216,7 +219,7 @@ def main(trials: int = 72) -> None:
         twists = take(Path(folder) / "twists", trials // 3, protocol="press_twist")
         print(_labelled(twists).row("twists"), flush=True)
         for name, (about, change) in CASES.items():
-            changed = [Changed(recording, change, about) for recording in plain[::3]]
+            changed = [ChangedRecording(recording, change, about) for recording in plain[::3]]
             print(_labelled(changed).row(name), flush=True)
         print(f"\n{1e3 * total.seconds / len(plain):.0f} ms of processor time a trial")
         for line in tracks(plain[::3]):
@@ -249,8 +252,8 @@ def take(
     return list(campaign.recordings())
 
 
-def _labelled(recordings: Sequence[Any]) -> Found:
-    total = Found()
+def _labelled(recordings: Sequence[Any]) -> OnsetErrors:
+    total = OnsetErrors()
     for recording in recordings:
         total.add(onsets_by_events(recording, Labelling()), recording)
     return total

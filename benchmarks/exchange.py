@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.measure import Figures, Seconds, machine, one_core, rate, ratio
 from benchmarks.slides import many_events
-from sliplab.storage.formats.aedat4 import EVENTS, Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import EVENTS, Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.known import known_format
 from sliplab.storage.streams import EventChunk
 
@@ -134,7 +134,7 @@ def _ours(file: Path, form: str) -> EventChunk:
 
 
 def _ours_write(data: EventChunk, file: Path) -> None:
-    with Aedat4Writer(file, {0: Stream(EVENTS, "events", SIZE, "benchmark")}) as out:
+    with Aedat4Writer(file, {0: Aedat4Stream(EVENTS, "events", SIZE, "benchmark")}) as out:
         out.events(0, data)
 
 

@@ -33,7 +33,7 @@ from benchmarks.measure import SEED, Figures
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.plugins.claims.document import ClaimState
-from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.simulated import course
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
@@ -105,7 +105,7 @@ def world(number: int, seed: int) -> MockSettings:
     return prior_of(CLEAN, seed).world(number, pilot_slides()).rig.scene
 
 
-def figures(settings: MockSettings, grid: Grid, times: int) -> dict[str, F64]:
+def figures(settings: MockSettings, grid: TrialGrid, times: int) -> dict[str, F64]:
     """Return what slides show, (times, N) by figure, ms; infinite where the centre never slips."""
     skin = skin_of(settings)
     found = {name: np.empty((times, len(grid.trials))) for name in ("first_slip", "slip_duration")}
@@ -127,7 +127,7 @@ def quantile(values: F64, share: float) -> float:
     return float(ordered[max(int(np.ceil(share * len(ordered) - 1e-9)) - 1, 0)])
 
 
-def truth(stated: Stated, values: F64, grid: Grid) -> float:
+def truth(stated: Stated, values: F64, grid: TrialGrid) -> float:
     """Return the true figure of a claim, ms."""
     share = QUANTILES[stated.statistic]
     if stated.between is None:
@@ -153,7 +153,7 @@ def claim_of(stated: Stated, true: float) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Setting:
+class CampaignSetting:
     """How campaigns of one world are planned.
 
     Attributes:
@@ -166,7 +166,7 @@ class Setting:
     experiment: str = "kinematic"
 
 
-def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: Setting) -> Plan:
+def plan_of(order: str, claims: Sequence[dict[str, Any]], setting: CampaignSetting) -> Plan:
     """Return the plan of an experiment with claims."""
     source = ROOT / f"protocols/{setting.experiment}.yaml"
     data = parse_yaml(source.read_text(), source)
@@ -201,11 +201,11 @@ def campaign(
     order: str,
     claims: list[dict[str, Any]],
     values: dict[str, F64],
-    setting: Setting,
+    setting: CampaignSetting,
 ) -> list[Call | None]:
     """Return the call of each claim; None for never."""
     plan = plan_of(order, claims, setting)
-    went = course(plan, Grid.of(plan), values)
+    went = course(plan, TrialGrid.of(plan), values)
     ends = went.evidence.looks
     return [None if it.look is None else Call(int(ends[it.look]), it.state) for it in went.claims]
 
@@ -213,8 +213,8 @@ def campaign(
 def world_row(number: int, seed: int, adaptive: int, batch: int) -> dict[str, Any]:
     """Do both campaigns in one world."""
     with threadpool_limits(1):
-        setting = Setting(hash_integer("campaign", seed, number), batch)
-        grid = Grid.of(plan_of("shuffled", [claim_of(CLAIMS[0], 1000.0)], setting))
+        setting = CampaignSetting(hash_integer("campaign", seed, number), batch)
+        grid = TrialGrid.of(plan_of("shuffled", [claim_of(CLAIMS[0], 1000.0)], setting))
         settings = world(number, seed)
         grids = figures(settings, grid, TIMES)
         values = {name: each[0] for name, each in grids.items()}

@@ -31,7 +31,7 @@ from benchmarks.fewer import (
     F64,
     ORDERS,
     ROOT,
-    Setting,
+    CampaignSetting,
     campaign,
     in_worlds,
     plan_of,
@@ -39,10 +39,10 @@ from benchmarks.fewer import (
 )
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.expectation import coded, expectation
 from sliplab.plugins.claims.power.drawing import SHARES, Drawing
-from sliplab.plugins.claims.power.resampling import Pilot, shared_axes
+from sliplab.plugins.claims.power.resampling import PilotFigures, shared_axes
 from sliplab.plugins.claims.trial_figures import Judge, trial_figures
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES
@@ -93,14 +93,14 @@ def write_figures(store: Path, model: Path) -> None:
 
 
 @cache
-def fitted(experiment: str, figure: str) -> tuple[Grid, F64, F64, float, float]:
+def fitted(experiment: str, figure: str) -> tuple[TrialGrid, F64, F64, float, float]:
     """Return the grid, what is expected of each trial, residuals, and how often none is detected.
 
     The last is the value of a trial that is not detected.
     """
     table = pd.read_csv(TABLE)
     table = table[table["experiment"] == experiment].reset_index(drop=True)
-    grid = Grid.of(load_plan(ROOT / f"protocols/{experiment}.yaml"))
+    grid = TrialGrid.of(load_plan(ROOT / f"protocols/{experiment}.yaml"))
     keys = [tuple(_number(level) for _, level in trial.condition) for trial in grid.trials]
     first = {key: number for number, key in reversed(list(enumerate(keys)))}
     names = [name for name, _ in grid.trials[0].condition]
@@ -118,7 +118,7 @@ def _number(level: Any) -> float | str:
     return level if isinstance(level, str) else float(level)
 
 
-def figures_of(number: int, seed: int, title: str) -> tuple[Grid, F64]:
+def figures_of(number: int, seed: int, title: str) -> tuple[TrialGrid, F64]:
     """Return the figures of `GRIDS` campaigns in one world, (GRIDS, N) by the grid's trials."""
     experiment, claim = CLAIMS[title]
     grid, mean, residuals, lost, never = fitted(experiment, claim["figure"])
@@ -131,12 +131,12 @@ def figures_of(number: int, seed: int, title: str) -> tuple[Grid, F64]:
     return grid, y
 
 
-def setting_of(number: int, seed: int, experiment: str) -> Setting:
+def setting_of(number: int, seed: int, experiment: str) -> CampaignSetting:
     """Return how campaigns of one world are planned."""
-    return Setting(hash_integer("campaign", seed, number), BATCHES[experiment], experiment)
+    return CampaignSetting(hash_integer("campaign", seed, number), BATCHES[experiment], experiment)
 
 
-def _places(grid: Grid, other: Grid) -> list[int]:
+def _places(grid: TrialGrid, other: TrialGrid) -> list[int]:
     """Return where the trials of a grid with another seed stand in the first one."""
     at = {(trial.condition, trial.repetition): k for k, trial in enumerate(grid.trials)}
     return [at[trial.condition, trial.repetition] for trial in other.trials]
@@ -152,7 +152,7 @@ def world_row(number: int, seed: int, adaptive: int) -> dict[str, Any]:
             setting = setting_of(number, seed, experiment)
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
-                taken = y[0][_places(grid, Grid.of(plan_of(order, [claim], setting)))]
+                taken = y[0][_places(grid, TrialGrid.of(plan_of(order, [claim], setting)))]
                 (call,) = campaign(order, [claim], {figure: taken}, setting)
                 row[title][order] = [
                     len(grid.trials),
@@ -187,7 +187,7 @@ def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str,
             row[title] = {}
             for order in ORDERS if number < adaptive else ORDERS[:1]:
                 plan = plan_of(order, [claim], setting)
-                own = _places(grid, Grid.of(plan))
+                own = _places(grid, TrialGrid.of(plan))
                 calls = [campaign(order, [claim], {figure: each[own]}, setting) for each in y[:-1]]
                 took = [total if call is None else call.trials for (call,) in calls]
                 pilot = _pilot(plan, grid, y[-1], figure, np.random.default_rng([seed, number]))
@@ -201,7 +201,9 @@ def forecast_row(number: int, seed: int, adaptive: int, draws: int) -> dict[str,
     return row
 
 
-def _pilot(plan: Plan, grid: Grid, y: F64, figure: str, rng: np.random.Generator) -> Pilot:
+def _pilot(
+    plan: Plan, grid: TrialGrid, y: F64, figure: str, rng: np.random.Generator
+) -> PilotFigures:
     """Return `PILOT` of a grid's trials as a pilot, or a third of them where that is less."""
     count = len(grid.trials)
     taken = rng.choice(count, min(PILOT, count // 3), replace=False)
@@ -209,7 +211,7 @@ def _pilot(plan: Plan, grid: Grid, y: F64, figure: str, rng: np.random.Generator
     conditions = [dict(trial.condition) for trial in trials]
     axes, _ = shared_axes(plan, conditions)
     blocks = np.array([trial.block for trial in trials], np.int64)
-    return Pilot(axes, tuple(conditions), blocks, {figure: y[taken]})
+    return PilotFigures(axes, tuple(conditions), blocks, {figure: y[taken]})
 
 
 def by_claim(rows: Sequence[dict[str, Any]]) -> Iterator[tuple[str, list[Any]]]:

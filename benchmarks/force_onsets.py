@@ -31,7 +31,7 @@ THRESHOLD_MM, NOISE_N = 0.1, 0.005
 
 
 @dataclass(frozen=True)
-class Onsets:
+class SlideOnsets:
     """Onsets of a slide by force and by what is true, ms after the motion began."""
 
     incipient_ms: float
@@ -63,7 +63,7 @@ def _run(springs: Springs, tips: Tips, path: F64, step_s: float) -> tuple[F64, F
     return track, load.reshape(steps, n, 3).sum(axis=1)
 
 
-def slide(depth_mm: float, speed_mm_s: float, seed: int) -> Onsets:
+def slide(depth_mm: float, speed_mm_s: float, seed: int) -> SlideOnsets:
     """Press, hold and slide; return the onsets."""
     rig, _ = load_rig_file(shipped_rigs()["mock_force"])
     skin = skin_of(rig.scene)
@@ -88,7 +88,7 @@ def slide(depth_mm: float, speed_mm_s: float, seed: int) -> Onsets:
     incipient, gross = (
         np.nan if ns is None else 1e-6 * ns for ns in (by_force.incipient_ns, by_force.gross_ns)
     )
-    return Onsets(
+    return SlideOnsets(
         float(incipient),
         float(gross),
         float(np.nanmin(slips)),

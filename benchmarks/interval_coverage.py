@@ -29,7 +29,7 @@ Draw = Callable[[np.random.Generator, npt.NDArray[np.float64]], Counts]
 
 
 @dataclass(frozen=True)
-class Coverage:
+class IntervalCoverage:
     """How often an interval holds the truth.
 
     Attributes:
@@ -82,17 +82,19 @@ def _rates(
     mean: npt.NDArray[np.float64],
     counts: Callable[[np.random.Generator], Counts],
     strata: Sequence[Hashable] | None,
-) -> Coverage:
+) -> IntervalCoverage:
     """Cover the rate 1 an hour of clusters whose hours are their expected numbers of alarms."""
     rng = np.random.default_rng(SEED)
     spans = np.array([rate_interval(counts(rng), mean, strata) for _ in range(draws)])
     held = (spans[:, 0] <= 1) & (spans[:, 1] >= 1)
-    return Coverage(case, len(mean), draws, int(held.sum()), float(np.median(np.diff(spans))))
+    return IntervalCoverage(
+        case, len(mean), draws, int(held.sum()), float(np.median(np.diff(spans)))
+    )
 
 
 def alarm_rates(
     draws: int = 1000, sizes: Sequence[int] = (8, 16, 24, 32, 64, 156)
-) -> Iterator[Coverage]:
+) -> Iterator[IntervalCoverage]:
     """Cover rates of alarms in clusters: by size, and for trials of a design with nuisances.
 
     Args:
@@ -121,7 +123,7 @@ def alarm_rates(
 
 def medians_by_world(
     draws: int = 1000, sizes: Sequence[int] = (6, 8, 16, 32), slides: int = 12
-) -> Iterator[Coverage]:
+) -> Iterator[IntervalCoverage]:
     """Cover the median 1 of lognormal latencies of slides in worlds, a few of them missed.
 
     Args:
@@ -141,7 +143,7 @@ def medians_by_world(
                 held += span[0] <= 1 <= span[1]
                 widths.append(span[1] - span[0])
             case = f"{between:.0%} of the variance between worlds"
-            yield Coverage(case, size, draws, held, float(np.median(widths)))
+            yield IntervalCoverage(case, size, draws, held, float(np.median(widths)))
 
 
 def main() -> None:

@@ -22,8 +22,8 @@ import numpy as np
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from sliplab.analysis.labels.markers import MarkerTracks, track
 from sliplab.analysis.labels.plate_tracking import VideoTracks, track_video
-from sliplab.rigs.mock.settings import FrameCamera, MockSettings
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.storage.streams import F64, U8
 from sliplab.storage.trials.video import VideoWriter, read_frames
@@ -59,7 +59,7 @@ PARAMETERS = {
 def measure(frames: int = 600, runs: int = RUNS) -> Figures:
     """Times per frame, centroids against each other and the truth, and decoding with tracking."""
     print(json.dumps(PARAMETERS), file=sys.stderr)
-    few, truth = _video(min(frames, KEPT), FrameCamera().noise)
+    few, truth = _video(min(frames, KEPT), MockFrameCameraSettings().noise)
     images = _to_and_fro(few, frames)
     clean, truth = _video(frames, 0.0)
     layout = truth[0] - truth[0, 0]
@@ -149,7 +149,7 @@ def _video(
     frames: int, noise: float, side: int = SIDE_PX, plate: bool = False
 ) -> tuple[list[U8], F64]:
     """A skin that slides 6 mm, and the true centres in pixels; a plate falls by a millimetre."""
-    camera = FrameCamera()
+    camera = MockFrameCameraSettings()
     optics = FrameOptics(
         px_per_mm=camera.px_per_mm,
         tip_radius_mm=camera.tip_radius_mm,
@@ -158,7 +158,7 @@ def _video(
         noise=noise,
     )
     view = PlateView(optics, side, side)
-    layout = World(MockSettings(seed=SEED)).skin.layout_mm
+    layout = SimulatedWorld(MockSettings(seed=SEED)).skin.layout_mm
     along = np.linspace(-3.0, 3.0, 600)[:frames, None, None]
     tips = layout[None] + along * np.array([1.0, 0.3])
     images = np.empty((frames, side, side), np.uint8)
@@ -173,7 +173,7 @@ def _from_file(frames: int, layout: F64, runs: int) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         slide, fall = Path(folder) / "slide.mkv", Path(folder) / "fall.mkv"
         for path, plate in ((slide, False), (fall, True)):
-            images, _ = _video(frames, FrameCamera().noise, STORED_PX, plate)
+            images, _ = _video(frames, MockFrameCameraSettings().noise, STORED_PX, plate)
             video = VideoWriter(path, STORED_PX, STORED_PX, RATE_HZ)
             video.write(np.stack(images))
             video.close()

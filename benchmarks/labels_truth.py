@@ -25,7 +25,7 @@ import numpy.typing as npt
 from benchmarks.labels_summary import FRAME_MS, Checked, summary, tables, verdicts
 from benchmarks.measure import SEED, Figures
 from sliplab.analysis.labels.labelling import Label, label_places
-from sliplab.analysis.labels.markers import MarkerTracker, Measured, stack_tracks
+from sliplab.analysis.labels.markers import FrameMarkers, MarkerTracker, stack_tracks
 from sliplab.analysis.labels.places import from_tracks
 from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge
 from sliplab.analysis.sweeps.runner import sample_trials
@@ -55,7 +55,7 @@ class _Eye:
     plate: bool
     jitter: np.random.Generator | None = None
     t_ns: list[I64] = field(default_factory=list)
-    markers: list[Measured] = field(default_factory=list)
+    markers: list[FrameMarkers] = field(default_factory=list)
     poses: list[PlatePose] = field(default_factory=list)
     places: list[F64] = field(default_factory=list)
 

@@ -18,7 +18,7 @@ from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
 from benchmarks.slides import slide_events
 from sliplab.analysis.detectors.live import LiveDetector
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.protocols.settings import Detection, Windows
 
 PACKET_US = 5_000
@@ -32,7 +32,7 @@ def measure(seconds: float = HOUR_S) -> Figures:
     length = last - first + PACKET_US
     edges = np.searchsorted(events.t_us, np.arange(first, last + PACKET_US, PACKET_US))
     parts = [slice(int(a), int(b)) for a, b in pairwise(edges) if b > a]
-    engine = Engine(gridded(Windows(), SEED), Windows().cells)
+    engine = SpikeEngine(gridded(Windows(), SEED), Windows().cells)
     live = LiveDetector(lambda x: engine.counts(x, 1), Windows(), Detection())
     live.warm_up()
     taken = array("d")  # a list would grow by more than the detector

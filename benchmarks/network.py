@@ -21,7 +21,7 @@ import torch
 from torch import nn
 
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
-from benchmarks.network_rivals import Rival, installed
+from benchmarks.network_rivals import RivalNetwork, installed
 from benchmarks.slides import slide_events
 from sliplab.analysis.networks.network import (
     build,
@@ -33,18 +33,18 @@ from sliplab.analysis.networks.network import (
     set_weights,
     spike_counts,
 )
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import fit
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import bin_events, list_events
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.storage.streams import I64, U8, EventChunk
 
 BATCH = 32
 ROUNDS = 3
 """Repetitions of one window's inference within a run, where ours takes a tenth of a millisecond."""
-OUTPUTS = 3 * Network().outputs_per_class
+OUTPUTS = 3 * NetworkSettings().outputs_per_class
 MACS = (3200 * 25, 1600 * 72, 1600 * 32, 32 * OUTPUTS)
 """Multiply-adds a step of the dense layers."""
 
@@ -60,7 +60,7 @@ def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures
     net = gridded(settings, SEED)
     rivals: dict[str, tuple[Any, Forward]] = {"sinabs": (net, _sinabs(net))}
     for name, make in installed().items():
-        rival = Rival(make, settings, SEED)
+        rival = RivalNetwork(make, settings, SEED)
         rivals[name] = (rival, rival)
     return {
         **_training(x, y, settings, rivals, runs),
@@ -72,7 +72,7 @@ def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures
 
 def gridded(settings: Windows, seed: int) -> nn.Sequential:
     """A fresh network with its weights on the grid."""
-    net = build(Network(), settings, seed)
+    net = build(NetworkSettings(), settings, seed)
     set_weights(net, by_parameter(on_grid(matrices(net))))
     return net
 
@@ -111,7 +111,16 @@ def _training(
             kept = SampleSet.load(path)
             rows = np.arange(len(x))
             parts = [kept.windows.take(part) for part in (rows[:split], rows[split:])]
-            fit(parts[0], y[:split], parts[1], y[split:], Network(), settings, training, SEED)
+            fit(
+                parts[0],
+                y[:split],
+                parts[1],
+                y[split:],
+                NetworkSettings(),
+                settings,
+                training,
+                SEED,
+            )
 
         def theirs(module: Any, forward: Forward) -> Callable[[], None]:
             def epoch() -> None:
@@ -183,7 +192,7 @@ def _inference(
     runs: int,
 ) -> Figures:
     """One window at a time, and all of them, each side at its best batch."""
-    engine = Engine(net, settings.cells)
+    engine = SpikeEngine(net, settings.cells)
     few = x[: min(singles, len(x))]
 
     def one_by_one(forward: Forward) -> Callable[[], object]:
@@ -225,7 +234,7 @@ def _inference(
     for seed in range(SEED, SEED + 4):
         other = gridded(settings, seed)
         expected = spike_counts(other, x)
-        found = Engine(other, settings.cells).counts(x)
+        found = SpikeEngine(other, settings.cells).counts(x)
         mismatches += int((found != expected).any(axis=1).sum())
         compared += int(expected.any(axis=1).sum())
     return {
@@ -248,7 +257,7 @@ def _floor(x: U8, net: nn.Sequential, settings: Windows) -> Figures:
     best = min(alternate(RUNS, product=alone)["product"])
     macs_per_s = 20 * 512**3 / best
     sparse = SparseWindows.of(x)
-    _, fired = Engine(net, settings.cells).spikes(sparse)
+    _, fired = SpikeEngine(net, settings.cells).spikes(sparse)
     operations = len(sparse.cell) * 200 + int((fired[:, :3] * np.array([36, 32, OUTPUTS])).sum())
     each = operations / len(x)
     return {

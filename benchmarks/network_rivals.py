@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from sliplab.analysis.networks.network import WEIGHTED, build, by_class
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]
 """Currents (n, steps, ...) to spikes of the same shape, from rest."""
@@ -32,12 +32,12 @@ def installed() -> dict[str, Callable[[], Neuron]]:
     return {name: make for name, (module, make) in makers.items() if find_spec(module)}
 
 
-class Rival(nn.Module):
+class RivalNetwork(nn.Module):
     """The network with another library's neurons."""
 
     def __init__(self, make: Callable[[], Neuron], windows: Windows, seed: int) -> None:
         super().__init__()
-        net = build(Network(), windows, seed)
+        net = build(NetworkSettings(), windows, seed)
         self.dense = nn.ModuleList([getattr(net, name) for name in WEIGHTED])
         self._fire = [make() for _ in WEIGHTED]
 

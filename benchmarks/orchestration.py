@@ -37,7 +37,7 @@ from sliplab.flows.running.orchestration import (
 DRAIN_LIMIT_S = 120.0
 
 
-class _Steps:
+class _EmptySession:
     """Stands where a session does: takes trials and does nothing."""
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ def _flows() -> Any:
     @flow(name="collect", validate_parameters=False, persist_result=False)
     def collect(wanted: Opaque[tuple[range, int, Any]]) -> str:
         every, size, look = wanted.content
-        session: Any = _Steps()
+        session: Any = _EmptySession()
         for at in range(0, len(every), size):
             take_trials(Opaque(session), Opaque(every[at : at + size]))
             look(session.taken)
@@ -102,7 +102,7 @@ def _compare(trials: int, runs: int) -> Figures:
     spent: dict[str, Seconds] = {"batched": [], "per_trial": []}
 
     def loop() -> None:
-        _Steps().take(every)
+        _EmptySession().take(every)
 
     def through_prefect(name: str, size: int) -> None:
         before = time.process_time() + _server_cpu_s()

@@ -70,7 +70,7 @@ whatever moves an onset or a rate by a tenth (`benchmarks.scene_tradeoff`)."""
 
 
 @dataclass(frozen=True)
-class Setting:
+class ParameterSetting:
     """One assumed number at a factor of its value; the scene as it is has neither."""
 
     parameter: str | None = None
@@ -103,10 +103,10 @@ class Setting:
         return found
 
 
-def lower_and_higher(parameters: Sequence[str]) -> list[Setting]:
+def lower_and_higher(parameters: Sequence[str]) -> list[ParameterSetting]:
     """Return each parameter lower, then higher."""
     factors = (1.0 - CHANGE, 1.0 + CHANGE)
-    return [Setting(name, factor) for name in parameters for factor in factors]
+    return [ParameterSetting(name, factor) for name in parameters for factor in factors]
 
 
 def value_of(simulated: Any, name: str) -> float | None:
@@ -127,7 +127,7 @@ def in_all(names: Sequence[str], scenes: Sequence[Any]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SceneOutcome:
     """Onsets and event rates of the scene at one setting.
 
     Attributes:
@@ -141,9 +141,9 @@ class Outcome:
 
 def sensitivity_table(
     values: Mapping[str, float | None],
-    base: Outcome,
-    outcomes: Mapping[Setting, Outcome],
-    other_seed: Outcome,
+    base: SceneOutcome,
+    outcomes: Mapping[ParameterSetting, SceneOutcome],
+    other_seed: SceneOutcome,
     event_trials: int,
 ) -> Json:
     """Return the change of onsets and event rates for each parameter, as plain data.
@@ -180,7 +180,7 @@ def sensitivity_table(
     }
 
 
-def outcome_change(base: Outcome, other: Outcome) -> Json:
+def outcome_change(base: SceneOutcome, other: SceneOutcome) -> Json:
     """Return the change of onsets, over trials that have them in both, and of event rates."""
     both = np.isfinite(base.onsets_s) & np.isfinite(other.onsets_s)
     apart = np.where(both, other.onsets_s - base.onsets_s, np.nan)

@@ -30,10 +30,10 @@ import numpy.typing as npt
 from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
-from benchmarks.interval_coverage import Coverage, alarm_rates, medians_by_world
+from benchmarks.interval_coverage import IntervalCoverage, alarm_rates, medians_by_world
 from benchmarks.measure import SEED, Figures
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.simulated import course
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
@@ -51,7 +51,7 @@ GRID = 3, 3, 4
 
 
 @dataclass(frozen=True)
-class Kind:
+class CampaignKind:
     """How the trials of a campaign resemble each other, or are missing.
 
     Attributes:
@@ -106,23 +106,23 @@ PLANNED = Design()
 COMPARED = tuple(Design(order, 12, 12, 288) for order in ("shuffled", "adaptive"))
 
 KINDS = (
-    Kind("independent"),
-    Kind("blocks differ by 10 %", blocks=0.1),
-    Kind("blocks differ by 25 %", blocks=0.25),
-    Kind("blocks differ by 50 %", blocks=0.5),
-    Kind("blocks differ by 100 %", blocks=1.0),
-    Kind("AR(1) of 0.5", memory=0.5),
-    Kind("AR(1) of 0.9", memory=0.9),
-    Kind("drift of 100 %", drift=1.0),
-    Kind("5 % missing, at random", missing=0.05),
-    Kind("10 % missing, the longest", missing=0.1, by_outcome=True),
+    CampaignKind("independent"),
+    CampaignKind("blocks differ by 10 %", blocks=0.1),
+    CampaignKind("blocks differ by 25 %", blocks=0.25),
+    CampaignKind("blocks differ by 50 %", blocks=0.5),
+    CampaignKind("blocks differ by 100 %", blocks=1.0),
+    CampaignKind("AR(1) of 0.5", memory=0.5),
+    CampaignKind("AR(1) of 0.9", memory=0.9),
+    CampaignKind("drift of 100 %", drift=1.0),
+    CampaignKind("5 % missing, at random", missing=0.05),
+    CampaignKind("10 % missing, the longest", missing=0.1, by_outcome=True),
 )
 
 
 COMPARED_KINDS = (
     KINDS[0],
-    Kind("effects by factor", by_factor=True),
-    Kind("scatter of 300 % at one of three speeds", uneven=3.0, by_factor=True),
+    CampaignKind("effects by factor", by_factor=True),
+    CampaignKind("scatter of 300 % at one of three speeds", uneven=3.0, by_factor=True),
     *(kind for kind in KINDS if kind.blocks == 0.5 or kind.drift or kind.missing == 0.05),
 )
 
@@ -139,14 +139,16 @@ def effects(by_factor: bool = False) -> F64:
     return np.asarray(found - found.mean())
 
 
-def deviations(kind: Kind) -> F64:
+def deviations(kind: CampaignKind) -> F64:
     """Return the deviation between trials of each condition, of `TRIAL_MS`."""
     found = np.ones(GRID)
     found[:, -1] = kind.uneven
     return found.ravel()
 
 
-def figures(kind: Kind, design: Design, grid: Grid, rng: np.random.Generator) -> tuple[F64, F64]:
+def figures(
+    kind: CampaignKind, design: Design, grid: TrialGrid, rng: np.random.Generator
+) -> tuple[F64, F64]:
     """Return a figure of each trial, ms, NaN where it is missing; and what time adds to each."""
     count = len(grid.trials)
     noise = rng.normal(size=count)
@@ -164,7 +166,7 @@ def figures(kind: Kind, design: Design, grid: Grid, rng: np.random.Generator) ->
 
 
 @cache
-def truth(kind: Kind) -> float:
+def truth(kind: CampaignKind) -> float:
     """Return the median of a kind, ms, of conditions repeated for ever."""
     centres = CENTRE_MS + effects(kind.by_factor)[:, None]
     centres = centres + TRIAL_MS * kind.drift * np.linspace(-0.5, 0.5, 201)
@@ -194,16 +196,16 @@ class Statement:
     centre: float
     between: tuple[float, ...] = ()
 
-    def of(self, ms: F64, kind: Kind) -> F64:
+    def of(self, ms: F64, kind: CampaignKind) -> F64:
         """Return figures in the statement's unit, with the truth of all at `centre`."""
         at = truth(kind) if self.statistic == "median" else CENTRE_MS
         return self.centre + self.scale * (ms - at)
 
-    def true(self, kind: Kind) -> float:
+    def true(self, kind: CampaignKind) -> float:
         """Return the true value; a difference's is positive."""
         return self.scale * _slope(kind) if self.between else self.centre
 
-    def claims(self, kind: Kind) -> list[dict[str, Any]]:
+    def claims(self, kind: CampaignKind) -> list[dict[str, Any]]:
         """Return two claims that are false by the least, a true one, and one of a width."""
         true, nudge, half = self.true(kind), 1e-6, 0.5 * TRIAL_MS * self.scale
         of: dict[str, Any] = {"figure": self.figure, "statistic": self.statistic}
@@ -218,7 +220,7 @@ class Statement:
         return [{**of, side: f"{at:.6f} {self.unit}"} for side, at in bounds]
 
 
-def _slope(kind: Kind) -> float:
+def _slope(kind: CampaignKind) -> float:
     """Return the effect of the fastest speed less that of the slowest, ms."""
     of_speed = effects(kind.by_factor).reshape(GRID).mean(axis=(0, 2))
     return float(of_speed[-1] - of_speed[0])
@@ -234,7 +236,7 @@ DIFFERENCE = Statement(
 
 
 def campaign(
-    number: int, kind: Kind, design: Design, stated: Statement, seed: int
+    number: int, kind: CampaignKind, design: Design, stated: Statement, seed: int
 ) -> tuple[int, int, int, float, float]:
     """Judge a statement of one campaign.
 
@@ -246,7 +248,7 @@ def campaign(
     with threadpool_limits(1):
         rng = np.random.default_rng([seed, hash_integer("kind", kind.name), number])
         plan = design.plan(stated.claims(kind), 1 if design == PLANNED else number + 1)
-        grid = Grid.of(plan)
+        grid = TrialGrid.of(plan)
         ms, over_time = figures(kind, design, grid, rng)
         values = {stated.figure: stated.of(ms, kind)}
         went = course(plan, grid, values, {stated.figure: stated.scale * over_time})
@@ -275,7 +277,7 @@ def _fixed(stated: Statement, y: F64) -> float:
 
 
 @dataclass(frozen=True)
-class Row:
+class StatementRow:
     """A statement in campaigns of a kind.
 
     Attributes:
@@ -293,13 +295,13 @@ class Row:
     wider: float
 
 
-def planned_rows(campaigns: int, seed: int, cores: int) -> list[Row]:
+def planned_rows(campaigns: int, seed: int, cores: int) -> list[StatementRow]:
     """Judge all kinds of campaigns in the plan's order."""
     cases = [(kind, PLANNED, stated) for kind in KINDS for stated in STATEMENTS]
     return _rows(cases, campaigns, seed, cores)
 
 
-def compared_rows(campaigns: int, seed: int, cores: int) -> list[Row]:
+def compared_rows(campaigns: int, seed: int, cores: int) -> list[StatementRow]:
     """Judge campaigns of both orders in the same worlds."""
     stated = [(kind, each) for kind in COMPARED_KINDS for each in STATEMENTS]
     stated.append((KINDS[0], DIFFERENCE))
@@ -308,8 +310,8 @@ def compared_rows(campaigns: int, seed: int, cores: int) -> list[Row]:
 
 
 def _rows(
-    cases: Sequence[tuple[Kind, Design, Statement]], campaigns: int, seed: int, cores: int
-) -> list[Row]:
+    cases: Sequence[tuple[CampaignKind, Design, Statement]], campaigns: int, seed: int, cores: int
+) -> list[StatementRow]:
     rows = []
     with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
         for kind, design, stated in cases:
@@ -318,7 +320,7 @@ def _rows(
                 list(pool.map(one, range(campaigns), chunksize=4)), np.float64
             ).T
             rows.append(
-                Row(
+                StatementRow(
                     stated.name,
                     kind.name if design == PLANNED else f"{kind.name}; {design.order}",
                     campaigns,
@@ -332,7 +334,7 @@ def _rows(
     return rows
 
 
-def lines(rows: Sequence[Row]) -> list[str]:
+def lines(rows: Sequence[StatementRow]) -> list[str]:
     """Return a table in Markdown."""
     made = [
         "| statement | trials | false claims called (95 %) | 95 % interval holds (95 %) "
@@ -367,7 +369,7 @@ def measure(campaigns: int = 200, cores: int = 2) -> Figures:
     return found
 
 
-def clustered(draws: int) -> Iterator[Coverage]:
+def clustered(draws: int) -> Iterator[IntervalCoverage]:
     """Yield the coverage of alarm rates and of medians over worlds."""
     yield from alarm_rates(draws, sizes=(24, 156))
     yield from medians_by_world(draws, sizes=(6, 16))

@@ -45,12 +45,12 @@ from sliplab.plugins.twin.misfits import misfits
 from sliplab.plugins.twin.parameters import PARAMETERS, settings_of, value_of
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.pilots import event_trials, simulate_pilot
-from sliplab.plugins.twin.posterior import Bank, Estimate, Fitted, fitted
-from sliplab.plugins.twin.statistics import Statistics, of_names, statistics
-from sliplab.plugins.twin.worlds import Prior, Slides, World
+from sliplab.plugins.twin.posterior import Bank, FittedBank, ParameterPosterior, fitted
+from sliplab.plugins.twin.statistics import SlideStatistics, of_names, statistics
+from sliplab.plugins.twin.worlds import DrawnWorld, Prior, Slides
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock import fault_settings as faults
-from sliplab.rigs.mock.settings import EventCamera
+from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64
@@ -58,7 +58,7 @@ from sliplab.storage.streams import F64
 ROOT = Path(__file__).parents[1]
 SPREAD, HIDDEN_SPREAD = 0.5, 0.3
 TILT_DEG = 1.0
-THRESHOLD = EventCamera().threshold
+THRESHOLD = MockEventCameraSettings().threshold
 FAINT = 2.67
 """A light is seen by pixels whose threshold is so many standard deviations below the mean."""
 FIRST_STREAMS = {
@@ -111,7 +111,7 @@ TENTHS = 10
 
 
 @dataclass(frozen=True)
-class Job:
+class WorldJob:
     """One world to simulate: its kind, one of `KINDS`, and its number among these."""
 
     kind: str
@@ -134,7 +134,7 @@ def pilot_slides() -> Slides:
     return Slides(plan, fitted, event_trials(fitted))
 
 
-def world_of(job: Job) -> World:
+def world_of(job: WorldJob) -> DrawnWorld:
     """Return a world of a kind."""
     prior = prior_of(job.kind, job.seed)
     if job.kind not in FIRST_KINDS:
@@ -172,7 +172,7 @@ def faults_of(
         yield faults.PlateSpot(kind="plate_spot", centre_mm=centre, radius_mm=4.0)
 
 
-def slides_of(job: Job, world: World) -> list[PilotTrial]:
+def slides_of(job: WorldJob, world: DrawnWorld) -> list[PilotTrial]:
     """Return the slides that a world of a kind shows."""
     if job.kind in DRIFTS:
         key, trials = DRIFTS[job.kind], world.slides.trials
@@ -199,7 +199,7 @@ def late(slide: PilotTrial) -> PilotTrial:
     return replace(slide, frame_s=stamps, base_mm=np.column_stack(base))
 
 
-def shown_by(job: Job) -> dict[str, Any]:
+def shown_by(job: WorldJob) -> dict[str, Any]:
     """Return what a world shows, with and without its forces."""
     world = world_of(job)
     found: dict[str, Any] = vars(job).copy()
@@ -211,13 +211,15 @@ def shown_by(job: Job) -> dict[str, Any]:
     return found
 
 
-def taken(jobs: Sequence[Job], file: Path | None, cores: int) -> dict[str, list[dict[str, Any]]]:
+def taken(
+    jobs: Sequence[WorldJob], file: Path | None, cores: int
+) -> dict[str, list[dict[str, Any]]]:
     """Return what worlds show by kind; those that the file has are not simulated again."""
-    kept: dict[Job, dict[str, Any]] = {}
+    kept: dict[WorldJob, dict[str, Any]] = {}
     if file is not None and file.exists():
         for line in file.read_text().splitlines():
             row = json.loads(line)
-            kept[Job(row["kind"], row["number"], row["seed"])] = row
+            kept[WorldJob(row["kind"], row["number"], row["seed"])] = row
     missing = sorted((job for job in jobs if job not in kept), key=lambda job: job.number)
     with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
         for job, row in zip(missing, pool.map(shown_by, missing), strict=True):
@@ -231,9 +233,9 @@ def taken(jobs: Sequence[Job], file: Path | None, cores: int) -> dict[str, list[
     return found
 
 
-def seen_in(row: Mapping[str, Any], name: str) -> Statistics:
+def seen_in(row: Mapping[str, Any], name: str) -> SlideStatistics:
     """Return what a world showed, with or without forces."""
-    return Statistics(**row[name])
+    return SlideStatistics(**row[name])
 
 
 def checks_of(
@@ -250,7 +252,7 @@ def checks_of(
 def run_misfits(asked: argparse.Namespace) -> None:
     """Print how many effects are found, by which stream, and false alarms."""
     counts = {BANK: asked.bank, CLEAN: asked.clean} | dict.fromkeys(STREAMS, asked.worlds)
-    jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
+    jobs = [WorldJob(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
     found = taken(jobs, asked.file, asked.cores)
     print("| world | forces | found | by the right stream | first check (worlds) |")
     print("| --- | --- | --- | --- | --- |")
@@ -270,10 +272,10 @@ def run_misfits(asked: argparse.Namespace) -> None:
 
 
 @dataclass(frozen=True)
-class Called:
+class CalledEstimate:
     """An estimate, the truth (logarithm), and the share of the posterior's samples below it."""
 
-    estimate: Estimate
+    estimate: ParameterPosterior
     truth: float
     rank: float
 
@@ -283,7 +285,7 @@ class Called:
         return self.estimate.low <= self.truth <= self.estimate.high
 
 
-Worlds = list[tuple[Called, ...]]
+Worlds = list[tuple[CalledEstimate, ...]]
 """Of each world, one for each parameter."""
 
 
@@ -293,7 +295,7 @@ def called(bank: Bank, observed: F64, truths: F64) -> Worlds:
     Args:
         observed: statistics, (k, q). truths: logarithms of parameters, (k, p).
     """
-    fits: dict[bytes, Fitted] = {}
+    fits: dict[bytes, FittedBank] = {}
     found = []
     for seen, truth in zip(observed, truths, strict=True):
         usable = np.isfinite(seen)
@@ -302,7 +304,7 @@ def called(bank: Bank, observed: F64, truths: F64) -> Worlds:
             fits[key] = fitted(bank, usable)
         said = fits[key].at(seen)
         ranks = (said.samples < truth).mean(axis=0)
-        found.append(tuple(map(Called, said.estimates, truth.tolist(), ranks.tolist())))
+        found.append(tuple(map(CalledEstimate, said.estimates, truth.tolist(), ranks.tolist())))
     return found
 
 
@@ -330,7 +332,7 @@ def coverage_lines(worlds: Worlds, forces: str) -> Iterator[str]:
     yield f"| all | {forces} | {' | '.join(_cells(known, sum(map(len, worlds))))} |"
 
 
-def _cells(known: Sequence[Called], of: int) -> tuple[str, str, str]:
+def _cells(known: Sequence[CalledEstimate], of: int) -> tuple[str, str, str]:
     if not known:
         return f"0 of {of}", "-", "-"
     holds = sum(one.holds for one in known)
@@ -342,7 +344,7 @@ def _cells(known: Sequence[Called], of: int) -> tuple[str, str, str]:
 def run_coverage(asked: argparse.Namespace) -> None:
     """Print how often intervals hold the truth, and how far medians are off."""
     counts = {BANK: asked.bank, CLEAN: asked.clean}
-    jobs = [Job(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
+    jobs = [WorldJob(kind, n, asked.seed) for kind, count in counts.items() for n in range(count)]
     found = taken(jobs, asked.file, asked.cores)
     prior, hidden = prior_of(BANK, asked.seed), prior_of(CLEAN, asked.seed)
     banks = {name: prior.bank([seen_in(row, name) for row in found[BANK]]) for name in FORCES}

@@ -22,7 +22,7 @@ from sliplab.plugins.twin.effects import Effect, effects_of
 from sliplab.plugins.twin.needs.flow import WORLDS
 from sliplab.plugins.twin.needs.judging import Marked, Need, marked, marks, need
 from sliplab.plugins.twin.parameters import PARAMETERS, value_of
-from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_rig
+from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock.settings import Papilla, skin_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
@@ -80,7 +80,7 @@ def rigs(
     return found
 
 
-def shown(worlds: Sequence[World], settings: Json) -> Marked:
+def shown(worlds: Sequence[DrawnWorld], settings: Json) -> Marked:
     """Return what worlds show under other settings."""
     taken = [
         [marks(trial) for trial in replace(one, rig=changed(one.rig, settings)).take()]
@@ -117,7 +117,7 @@ def main() -> None:
     rig, trials = other_rig(own, {}, {}), slides()
     rng = np.random.default_rng(wanted.seed)
     worlds, pilots = (
-        [World(one, trials, int(rng.integers(2**31)), guess_of(own)) for one in of]
+        [DrawnWorld(one, trials, int(rng.integers(2**31)), guess_of(own)) for one in of]
         for of in (
             rigs(rig, papillae(rig, rng), WORLDS, rng, pixels=False),
             rigs(rig, papillae(rig, None), wanted.pilots, rng, pixels=True),

@@ -42,8 +42,8 @@ from benchmarks.twin import BANK, CLEAN, pilot_slides, prior_of
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.onset_references import Decided, decisions_of, references_of
 from sliplab.analysis.detectors.onset_references import Name as Onset
-from sliplab.analysis.evaluation.trials import Judged, judge
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.evaluation.trials import EvaluatedTrials, judge
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.intervals import drawn
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import rules_of, wanted_models
@@ -88,7 +88,7 @@ ONSETS: dict[Onset, str] = {"paper": "2 pixels (paper)", "change_point": "change
 
 
 @dataclass(frozen=True)
-class Figure:
+class StudyFigure:
     """A figure of a study.
 
     Attributes:
@@ -103,13 +103,15 @@ class Figure:
 
 
 FIGURES = {
-    "accuracy": Figure("accuracy (%)", "kinematic", None),
-    "kinematic": Figure("slides, incipient (ms)", "kinematic", "latency_incipient_ms"),
-    "gross": Figure("slides, gross (ms)", "kinematic", "latency_gross_ms"),
-    "gravity": Figure("gravity, incipient (ms)", "gravity", "latency_incipient_ms"),
-    "gravity_lead": Figure("gravity, lead (ms)", "gravity", "lead_ms"),
-    "disturbance": Figure("disturbance, incipient (ms)", "disturbance", "latency_incipient_ms"),
-    "disturbance_lead": Figure("disturbance, lead (ms)", "disturbance", "lead_ms"),
+    "accuracy": StudyFigure("accuracy (%)", "kinematic", None),
+    "kinematic": StudyFigure("slides, incipient (ms)", "kinematic", "latency_incipient_ms"),
+    "gross": StudyFigure("slides, gross (ms)", "kinematic", "latency_gross_ms"),
+    "gravity": StudyFigure("gravity, incipient (ms)", "gravity", "latency_incipient_ms"),
+    "gravity_lead": StudyFigure("gravity, lead (ms)", "gravity", "lead_ms"),
+    "disturbance": StudyFigure(
+        "disturbance, incipient (ms)", "disturbance", "latency_incipient_ms"
+    ),
+    "disturbance_lead": StudyFigure("disturbance, lead (ms)", "disturbance", "lead_ms"),
 }
 POINTS, SHARE = 1.0, 0.1
 """Largest difference of accuracy and, relative, of each median."""
@@ -210,7 +212,7 @@ def calibrated(asked: argparse.Namespace, folder: Path, hidden: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class Study:
+class TrainedStudy:
     """Labelled trials of a study, and the networks that it trained."""
 
     store: Store
@@ -220,7 +222,7 @@ class Study:
     def outcomes(self, networks: Sequence[Fitted]) -> Outcomes:
         """Test networks on the study's test trials, by its protocols' rules."""
         rules = rules_of(self.campaigns, networks[0].network.outputs_per_class)
-        labels = Labels(self.store)
+        labels = StoreLabels(self.store)
         references = {
             (item.name, trial.id): references_of(recording, labels.read(item, recording))
             for item in self.campaigns
@@ -228,31 +230,32 @@ class Study:
         }
         judged = [judge(it, rules, self.store, self.campaigns) for it in networks]
         decisions = [decisions_of(it.rows, references, rules) for it in judged]
-        return {onset: Outcome.of(judged, decisions, onset) for onset in ONSETS}
+        return {onset: NetworkOutcome.of(judged, decisions, onset) for onset in ONSETS}
 
     @cached_property
     def samples(self) -> SampleSet:
         """The windows of the study's test slides."""
-        return load_samples(Labels(self.store), training_campaigns(self.campaigns), "test")
+        return load_samples(StoreLabels(self.store), training_campaigns(self.campaigns), "test")
 
-    def windows(self, networks: Sequence[Fitted]) -> Outcome:
+    def windows(self, networks: Sequence[Fitted]) -> NetworkOutcome:
         """Test networks on the windows of the study's test slides; there are no times."""
         judged = [
-            Judged(predict_counts(it, self.samples.windows), self.samples, []) for it in networks
+            EvaluatedTrials(predict_counts(it, self.samples.windows), self.samples, [])
+            for it in networks
         ]
-        return Outcome.of(judged, [()] * len(judged), "paper")
+        return NetworkOutcome.of(judged, [()] * len(judged), "paper")
 
 
-def studied(rig: Path, files: Sequence[Path], folder: Path) -> Study:
+def studied(rig: Path, files: Sequence[Path], folder: Path) -> TrainedStudy:
     """Take, label and train what is missing of a study."""
     store, campaigns = retake([make_request(file, rig, folder) for file in files])
     train(store, campaigns)
     models = wanted_models(store, campaigns)
-    return Study(store, campaigns, [model_file.load(it.path) for it in models])
+    return TrainedStudy(store, campaigns, [model_file.load(it.path) for it in models])
 
 
 @dataclass(frozen=True)
-class Outcome:
+class NetworkOutcome:
     """What several networks make of the same test trials.
 
     Attributes:
@@ -268,8 +271,8 @@ class Outcome:
 
     @classmethod
     def of(
-        cls, judged: Sequence[Judged], decisions: Sequence[Sequence[Decided]], onset: Onset
-    ) -> Outcome:
+        cls, judged: Sequence[EvaluatedTrials], decisions: Sequence[Sequence[Decided]], onset: Onset
+    ) -> NetworkOutcome:
         """Collect what networks made of the trials of one store.
 
         Args:
@@ -326,7 +329,7 @@ class Outcome:
         found = {name: self.figure(name) for name in FIGURES}
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
-    def against(self, own: Outcome, name: str) -> tuple[float, float] | None:
+    def against(self, own: NetworkOutcome, name: str) -> tuple[float, float] | None:
         """Return the 95 % interval of how far a figure lies from `own`'s: points, or a share.
 
         Trials of both are drawn again together, since they have the same chance, and so are the
@@ -347,10 +350,10 @@ class Outcome:
         return float(low), float(high)
 
 
-Outcomes = Mapping[Onset, Outcome]
+Outcomes = Mapping[Onset, NetworkOutcome]
 
 
-def compared(found: Outcome, own: Outcome) -> dict[str, Any]:
+def compared(found: NetworkOutcome, own: NetworkOutcome) -> dict[str, Any]:
     """Return the figures of a study, and how far each is from the hidden world's own."""
     return {
         "figures": found.figures(),
@@ -382,7 +385,7 @@ def world_row(
     number: int,
     files: Sequence[Path],
     hidden_files: Sequence[Path],
-    assumed: Study,
+    assumed: TrainedStudy,
     usual: Outcomes,
 ) -> dict[str, Any]:
     """Do everything of one hidden world; return its figures.

@@ -16,7 +16,7 @@ from sliplab.analysis.evaluation.classes import (
     make_class_job,
 )
 from sliplab.analysis.evaluation.evaluation import STEP
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.report import classes as content
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import report_folder
@@ -58,7 +58,7 @@ def evaluate_on_classes(
                 value,
                 f"sets how slip is detected, and '{campaigns[0].name}' shows classes; leave it out",
             )
-    job = make_class_job(Labels(store, reviewed), campaigns)
+    job = make_class_job(StoreLabels(store, reviewed), campaigns)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
         run(evaluate_classes_flow, Opaque((job, cluster)), cluster)

@@ -32,7 +32,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.reacting import Evidence, Reaction, run_watched
+from sliplab.rigs.core.reacting import DetectionTimes, Reaction, run_watched
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
@@ -82,7 +82,7 @@ class ReflexJson(TypedDict):
     reaction_ms: NotRequired[ReactionMs]
 
 
-class ModelFile(TypedDict):
+class ModelPath(TypedDict):
     """Path and SHA-256 of a model file."""
 
     file: str
@@ -100,7 +100,7 @@ class DetectSummary(DetectNumbers):
 
     simulated: bool
     rig: str
-    model: ModelFile
+    model: ModelPath
     trial: str | None
     protocol: str | None
     virtual_time: bool
@@ -279,7 +279,7 @@ def _title(request: DetectRequest) -> str:
     return f"detect on {request.rig.name} ({mode}), model {request.model.name}"
 
 
-def _reaction_ms(reaction: Reaction, seen: Evidence) -> ReactionMs:
+def _reaction_ms(reaction: Reaction, seen: DetectionTimes) -> ReactionMs:
     command, actuator = reaction.command_ms, reaction.actuator_ms
     return {
         "window": seen.window_ms,

@@ -16,7 +16,7 @@ from sliplab.analysis.campaigns import (
 )
 from sliplab.analysis.detectors.predictions import count_spikes, predict_trials, seed_step
 from sliplab.analysis.evaluation import evaluation
-from sliplab.analysis.evaluation.evaluation import Job, make_job, score_store
+from sliplab.analysis.evaluation.evaluation import EvaluationJob, make_job, score_store
 from sliplab.analysis.networks.models import (
     training_settings,
 )
@@ -72,7 +72,7 @@ def evaluate(
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
-def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
+def evaluate_flow(argument: Opaque[tuple[EvaluationJob, Cluster | None]]) -> None:
     """Count spikes where needed, then score."""
     job, cluster = argument.content
     keep, threads = spike_keeper(job.store, cluster), None if cluster is None else 1
@@ -99,6 +99,6 @@ def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(argument: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
+def score(argument: Opaque[tuple[EvaluationJob, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, stored as one result."""
     score_store(*argument.content)

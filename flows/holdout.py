@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.holdout import NAME, STEP, Holdout
-from sliplab.analysis.sweeps.runner import Task, sample_trials, task_sweep
+from sliplab.analysis.sweeps.runner import SweepTask, sample_trials, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
@@ -77,7 +77,7 @@ def measure_holdout(
         """Take the missing trials, label and judge them."""
         return work.score(*retake([holdout_request(work)]))
 
-    sweep = task_sweep([Task(NAME, work.key, measure)], work.results)
+    sweep = task_sweep([SweepTask(NAME, work.key, measure)], work.results)
     done = 0
     if sweep.pending and work.judged_by(current) and not again:
         console.say(

@@ -11,7 +11,7 @@ from sliplab.analysis.campaigns import Collected, need_slip
 from sliplab.analysis.evaluation import networks
 from sliplab.analysis.evaluation.networks import Engines, Judgement, network_of
 from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms, summaries
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
@@ -90,7 +90,7 @@ def judge_model(
         StoreError: a trial has no label yet.
     """
     need_slip(campaigns)
-    network, labels = network_of(model, engine), Labels(store, reviewed)
+    network, labels = network_of(model, engine), StoreLabels(store, reviewed)
     judgement = networks.file_judgement(labels, campaigns, network, margin, smoothing)
     if network.engine == "fast" and not network.exact:
         console.say(
@@ -133,7 +133,7 @@ def evaluate_comparison(
         StoreError: it is missing or stale.
     """
     done = False
-    for judgement in networks.comparison_judgements(Labels(store, reviewed), campaigns):
+    for judgement in networks.comparison_judgements(StoreLabels(store, reviewed), campaigns):
         done |= _judge(judgement, cluster)
     return done
 

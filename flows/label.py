@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypedDict
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.labels.label_errors import CHECK, rules_compared
-from sliplab.analysis.labels.reviewed import Labels, State, label_key
+from sliplab.analysis.labels.reviewed import State, StoreLabels, label_key
 from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import run_trials
@@ -64,7 +64,7 @@ class Reviewed(TypedDict, total=False):
     reviewed: dict[State, int]
 
 
-def report_states(labels: Labels, campaigns: list[Collected]) -> Reviewed:
+def report_states(labels: StoreLabels, campaigns: list[Collected]) -> Reviewed:
     """Return review states as part of a step's result; warn of decisions that are not applied."""
     states = labels.states(campaigns)
     if states is None:

@@ -14,8 +14,8 @@ from sliplab.analysis.evaluation.markers import (
     train_marker_model,
     wanted_marker_models,
 )
-from sliplab.analysis.labels.reviewed import Labels
-from sliplab.analysis.networks.models import Model
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.windows.displacement import MarkerSamples, load_marker_samples
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
@@ -34,7 +34,7 @@ def train_on_markers(
     Raises:
         StoreError: labels or samples are missing.
     """
-    labels = Labels(store, reviewed)
+    labels = StoreLabels(store, reviewed)
     models = wanted_marker_models(labels, campaigns)
     stale = [model for model in models if not model.fresh]
     if stale:
@@ -48,7 +48,9 @@ def train_on_markers(
 
 
 @flow(name="train on markers", validate_parameters=False, persist_result=False)
-def train_markers_flow(argument: Opaque[tuple[Labels, list[Collected], list[Model]]]) -> None:
+def train_markers_flow(
+    argument: Opaque[tuple[StoreLabels, list[Collected], list[ModelOnDisk]]],
+) -> None:
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models = argument.content
     with timed(labels.store, "train"):
@@ -60,7 +62,7 @@ def train_markers_flow(argument: Opaque[tuple[Labels, list[Collected], list[Mode
 
 
 @task(name="train one seed on markers", cache_policy=NO_CACHE, persist_result=False)
-def train_one_on_markers(job: Opaque[tuple[Model, MarkerSamples, MarkerSamples]]) -> int:
+def train_one_on_markers(job: Opaque[tuple[ModelOnDisk, MarkerSamples, MarkerSamples]]) -> int:
     """Train one classifier and keep it."""
     model, train, validation = job.content
     net = train_marker_model(model, train, validation)
@@ -78,7 +80,7 @@ def evaluate_on_markers(
     reviewed: bool = False,
 ) -> StepResult:
     """Evaluate if any input or setting changed; see `evaluate.evaluate`."""
-    job = make_marker_job(Labels(store, reviewed), campaigns, margin, smoothing)
+    job = make_marker_job(StoreLabels(store, reviewed), campaigns, margin, smoothing)
     stale = not Derived.of(store, evaluation.STEP).fresh(evaluation.NAME, job.key)
     if stale:
         run(evaluate_markers_flow, Opaque(job))

@@ -120,7 +120,7 @@ def _planned_bytes(item: Collected) -> int:
     return round(plan_bytes(rig, item.plan, {trial.id for trial in item.plan} - done))
 
 
-def against(store: Store, other: Path) -> tuple[comparison.Comparison, Path]:
+def against(store: Store, other: Path) -> tuple[comparison.ReportComparison, Path]:
     """Compare the last report with another one, and write a page about it.
 
     Args:

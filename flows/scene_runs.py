@@ -19,12 +19,12 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
-from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.mock.settings import ClockErrors
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 
 MOTION = frozenset(ACTING)
-PERFECT = Clocks(
+PERFECT = ClockErrors(
     arm_ppm=0,
     event_camera_ppm=0,
     frame_camera_ppm=0,
@@ -41,7 +41,7 @@ Onsets = tuple[int | None, int | None]
 
 
 @dataclass(frozen=True)
-class Seen:
+class SceneRun:
     """Events and onsets of one run, on a time line that begins with its slide or retraction.
 
     Attributes:
@@ -107,7 +107,7 @@ class Memory(NullSink):
             self.forces.append(chunk)
 
 
-def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
+def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
     """Simulate a trial; return its data, on a time line that begins with its motion.
 
     Args:
@@ -134,7 +134,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
         after = None if onset is None else onset - int(truth["reference_ns"])
         return after if after is not None and after <= end_us * 1000 else None
 
-    return Seen(
+    return SceneRun(
         events=EventChunk(events.x[inside], events.y[inside], events.p[inside], t_us[inside]),
         size_px=(built.events.width, built.events.height),
         begin_us=begin_us,

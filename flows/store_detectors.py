@@ -12,9 +12,9 @@ from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.detectors.detectors import RULE, Levels, Smoothing, Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
 from sliplab.analysis.evaluation.detectors import detector_work
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import (
-    Model,
+    ModelOnDisk,
     choose_model,
     comparison_models,
     rules_of,
@@ -38,7 +38,7 @@ class NetworkDetectors:
     """A network with the detectors that read it, and the stride of the windows of each, ms."""
 
     title: str
-    model: Model
+    model: ModelOnDisk
     detectors: list[tuple[int, Tuned]]
 
 
@@ -55,7 +55,7 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
     rules = rules_of(campaigns, settings.network.outputs_per_class)
     rule = rules[training_campaigns(campaigns)[0].name]
     detectors = [(settings.stride_ms, _with_rule(rule))]
-    work = detector_work(Labels(store), campaigns, rules, model.key)
+    work = detector_work(StoreLabels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
         predict_trials(store, model.path, settings.windows, work.requests, keep)
@@ -67,7 +67,7 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
         yield NetworkDetectors(f"preset: {theirs.preset}", other, with_rule)
 
 
-def _others(store: Store, campaigns: list[Collected]) -> Iterator[Model]:
+def _others(store: Store, campaigns: list[Collected]) -> Iterator[ModelOnDisk]:
     """Yield the networks that `also` names. Raises StoreError if one is missing or stale."""
     for other in comparison_models(store, campaigns):
         if not other.fresh:

@@ -28,7 +28,7 @@ from sliplab.flows.label import check_labels, check_required, label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.steps import StepDone
-from sliplab.flows.study_ledger import Ledger, Row
+from sliplab.flows.study_ledger import Ledger, StudyStep
 from sliplab.flows.sync import sync
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
@@ -42,17 +42,17 @@ BASELINE_S = 0.0105
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StudyOutcome:
     """Results of every step of a study, and their times."""
 
     collected: list[CollectResult]
     steps: list[StepDone]
-    rows: list[Row]
+    rows: list[StudyStep]
 
 
 def study(
     run_requests: list[RunRequest], check: int = 0, more: Sequence[Search] = (), holdout: int = 0
-) -> Outcome:
+) -> StudyOutcome:
     """Run missing or stale steps in order; a step with nothing to do reports that.
 
     Args:
@@ -95,7 +95,7 @@ def study(
     for each in more:
         run(each.name, each.unit, partial(_search, each, store, campaigns))
     run("report", "pages", lambda: report(store, campaigns))
-    return Outcome(taken, steps, ledger.rows())
+    return StudyOutcome(taken, steps, ledger.rows())
 
 
 def _search(search: Search, store: Store, campaigns: list[Collected]) -> StepDone:

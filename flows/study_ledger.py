@@ -28,7 +28,7 @@ kernels, once in an installation, and predicts little about the others if it is 
 
 
 @dataclass(frozen=True)
-class Row:
+class StudyStep:
     """One step of a study.
 
     Attributes:
@@ -64,12 +64,14 @@ class Ledger:
         self._path, self._clock = folder / FILE, clock
         before = {row.name: row for row in read(folder)}
         self._rows = {
-            name: Row(name, TO_DO, before[name].seconds if name in before else 0.0, seconds, "")
+            name: StudyStep(
+                name, TO_DO, before[name].seconds if name in before else 0.0, seconds, ""
+            )
             for name, seconds in expected.items()
         }
         self._known = {name for name, row in before.items() if row.state == DONE}
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[StudyStep]:
         """Return all steps in their order."""
         return list(self._rows.values())
 
@@ -118,9 +120,11 @@ class Ledger:
         reports = f": about {console.duration(left)} left" if left else ""
         return reports + (f", {console.duration(spent)} so far" if spent else "")
 
-    def _put(self, row: Row, *, state: str, seconds: float | None = None, note: str = "") -> None:
+    def _put(
+        self, row: StudyStep, *, state: str, seconds: float | None = None, note: str = ""
+    ) -> None:
         spent = row.seconds if seconds is None else seconds
-        self._rows[row.name] = Row(row.name, state, spent, row.expected_s, note)
+        self._rows[row.name] = StudyStep(row.name, state, spent, row.expected_s, note)
         write_json(self._path, {"steps": [vars(each) for each in self._rows.values()]})
 
 
@@ -133,15 +137,15 @@ def _in_words(done: int, unit: str) -> str:
     return f"{done} {noun}{space}{rest}"
 
 
-def read(folder: Path) -> list[Row]:
+def read(folder: Path) -> list[StudyStep]:
     """Return the steps of a study as last written; none if there is no study."""
     path = folder / FILE
     if not path.exists():
         return []
-    return [Row(**row) for row in read_json(path)["steps"]]
+    return [StudyStep(**row) for row in read_json(path)["steps"]]
 
 
-def print_rows(rows: list[Row]) -> None:
+def print_rows(rows: list[StudyStep]) -> None:
     """Print state, cost and result of each step as a table."""
     total = sum(row.seconds for row in rows)
     shown: list[list[str]] = [

@@ -21,11 +21,11 @@ from sliplab.analysis.campaigns import (
     of_classes,
     training_campaigns,
 )
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.models import (
-    Model,
+    ModelOnDisk,
     begun,
     comparison_models,
     wanted_class_models,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
+def train_one(job: Opaque[tuple[ModelOnDisk, SampleSet, SampleSet, bool]]) -> int:
     """Train one network and keep it."""
     model, train, validation, simulated = job.content
     settings = model.settings
@@ -85,7 +85,7 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
 
 
 @uninterrupted
-def _keep(model: Model, fitted: training.Fitted, samples: ModelSamples) -> None:
+def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) -> None:
     """Write a network and its description, and delete the states of its training."""
     model_file.save(model.path, fitted)
     info = TrainedModel(
@@ -107,7 +107,7 @@ def _keep(model: Model, fitted: training.Fitted, samples: ModelSamples) -> None:
 
 @flow(name="train", validate_parameters=False, persist_result=False)
 def train_flow(
-    argument: Opaque[tuple[Labels, list[Collected], list[Model], Cluster | None]],
+    argument: Opaque[tuple[StoreLabels, list[Collected], list[ModelOnDisk], Cluster | None]],
 ) -> int:
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models, cluster = argument.content
@@ -145,7 +145,7 @@ def train(
     """
     if not of_classes(campaigns) and missing_stream(campaigns) == "events":
         return train_on_markers(store, campaigns, reviewed)
-    labels = Labels(store, reviewed)
+    labels = StoreLabels(store, reviewed)
     if of_classes(campaigns):
         used = agreeing(campaigns)
         models = wanted_class_models(store, used, reviewed)

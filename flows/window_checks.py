@@ -8,7 +8,7 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected, need_slip, of_classes
 from sliplab.analysis.evaluation import baselines
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import (
@@ -67,7 +67,7 @@ def window_baselines(
     classes = of_classes(campaigns)
     methods = baselines.class_methods(campaigns) if classes else baselines.slip_methods()
     of, make = methods.prefix, load_class_samples if classes else load_samples
-    train, validation, test = map(partial(make, Labels(store, reviewed), campaigns), SPLITS)
+    train, validation, test = map(partial(make, StoreLabels(store, reviewed), campaigns), SPLITS)
     kept = Derived.of(store, baselines.STEP)
     keys = {name: methods.key(store, name) for name in methods.names}
     stale = [name for name, key in keys.items() if not kept.fresh(f"{of}{name}", key)]
@@ -101,7 +101,7 @@ def window_checks(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     """
     need_slip(campaigns)
     settings = training_settings(campaigns)
-    load = partial(load_samples, Labels(store, reviewed), campaigns)
+    load = partial(load_samples, StoreLabels(store, reviewed), campaigns)
     train, validation, test = map(load, SPLITS)
     if not len(test):
         raise StoreError("there are no test samples to check; collect more trials")

@@ -14,11 +14,11 @@ from pydantic import Field, model_validator
 
 from sliplab.protocols.adapter_parts import (
     AdaptedStreams,
-    Factor,
+    AdapterFactor,
+    AdapterLabels,
     FieldName,
     FieldRule,
     GivenMotion,
-    Labels,
     Markers,
     TrialFiles,
 )
@@ -79,10 +79,10 @@ class Adapter(StrictModel):
     trials: TrialFiles
     fields: dict[FieldName, FieldRule] = Field(default_factory=dict)
     """Fields that are made from others, in their order."""
-    factors: dict[FactorName, Factor] = Field(default_factory=dict)
+    factors: dict[FactorName, AdapterFactor] = Field(default_factory=dict)
     """What was varied, each the values of a field."""
     streams: AdaptedStreams
-    labels: Labels = Labels()
+    labels: AdapterLabels = AdapterLabels()
     motion: GivenMotion | None = None
     """When the slide begins and ends, where that is known."""
     markers: Markers | None = None

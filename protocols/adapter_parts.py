@@ -84,7 +84,7 @@ class FieldRule(StrictModel):
     """New values by old ones; others stay as they are."""
 
 
-class Factor(StrictModel):
+class AdapterFactor(StrictModel):
     """A factor whose levels are values of a field."""
 
     field: str
@@ -95,7 +95,7 @@ class Factor(StrictModel):
     """Levels by value of the field, such as ``{"0": left}``; others stay as they are."""
 
     @rule
-    def _known_unit(self) -> Factor:
+    def _known_unit(self) -> AdapterFactor:
         if self.unit is not None and find_unit(self.unit) is None:
             known = ", ".join(all_symbols())
             raise KeyedError(".unit", self.unit, f"is no known unit; must be one of {known}")
@@ -395,7 +395,7 @@ class GivenSpans(_LabelTable):
     slip they become ``no_slip``, ``incipient`` and ``gross``."""
 
 
-class Labels(StrictModel):
+class AdapterLabels(StrictModel):
     """Labels that came with the data, in one of these ways."""
 
     whole: Template | None = Field(default=None, alias="class")
@@ -404,7 +404,7 @@ class Labels(StrictModel):
     spans: GivenSpans | None = None
 
     @rule
-    def _one(self) -> Labels:
+    def _one(self) -> AdapterLabels:
         ways = {"class": self.whole, "onsets": self.onsets, "spans": self.spans}
         given = [key for key, value in ways.items() if value is not None]
         if len(given) > 1:

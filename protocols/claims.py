@@ -43,7 +43,7 @@ one cause may all lie in one block, and 3 / share blocks miss it with a chance o
 
 
 @dataclass(frozen=True)
-class Figure:
+class ClaimFigure:
     """A figure that each trial has.
 
     Attributes:
@@ -59,13 +59,13 @@ class Figure:
     network: bool
 
 
-FIGURES: Mapping[str, Figure] = {
-    "accuracy": Figure("windows of a trial classified correctly", "%", "percent", 1.0, True),
-    "latency_incipient": Figure("latency of incipient slip", "ms", "s", 1000.0, True),
-    "latency_gross": Figure("latency of gross slip", "ms", "s", 1000.0, True),
-    "lead": Figure("lead of the detection before gross slip", "ms", "s", 1000.0, True),
-    "slip_duration": Figure("true length of incipient slip", "ms", "s", 1000.0, False),
-    "first_slip": Figure("incipient onset after the motion's start", "ms", "s", 1000.0, False),
+FIGURES: Mapping[str, ClaimFigure] = {
+    "accuracy": ClaimFigure("windows of a trial classified correctly", "%", "percent", 1.0, True),
+    "latency_incipient": ClaimFigure("latency of incipient slip", "ms", "s", 1000.0, True),
+    "latency_gross": ClaimFigure("latency of gross slip", "ms", "s", 1000.0, True),
+    "lead": ClaimFigure("lead of the detection before gross slip", "ms", "s", 1000.0, True),
+    "slip_duration": ClaimFigure("true length of incipient slip", "ms", "s", 1000.0, False),
+    "first_slip": ClaimFigure("incipient onset after the motion's start", "ms", "s", 1000.0, False),
 }
 
 
@@ -95,7 +95,7 @@ Amount = Annotated[Decimal, PlainSerializer(canonical), WithJsonSchema({"type": 
 """A percentage or a time, by the claim's figure."""
 
 
-class Difference(StrictModel):
+class LevelDifference(StrictModel):
     """Two levels of a factor that are compared, all else averaged."""
 
     factor: str
@@ -108,7 +108,7 @@ class Claim(StrictModel):
     figure: FigureName
     statistic: Statistic | None = None
     """Left out: the mean of accuracy, the median of times."""
-    between: Difference | None = None
+    between: LevelDifference | None = None
     """The claim is about the second level's statistic less the first one's; with `at_least`, about
     its size."""
     within: Amount | None = None
@@ -191,7 +191,7 @@ def repeated(claims: Sequence[Claim]) -> Iterator[int | None]:
         yield plain.index(claim) if claim in plain[:k] else None
 
 
-class Choice(StrictModel):
+class AdaptiveChoice(StrictModel):
     """How `order: adaptive` chooses the next trials."""
 
     batch: Annotated[int, Field(ge=1, le=1000)] = 12

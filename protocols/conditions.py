@@ -31,7 +31,7 @@ class Region(StrictModel):
     height: PositiveMillimetres
 
 
-class Recording(StrictModel):
+class RecordingSettings(StrictModel):
     """Streams kept of each trial, from the end of settling to the end of the motion."""
 
     region: Region
@@ -48,14 +48,14 @@ class Recording(StrictModel):
         return streams
 
 
-class Axis(StrictModel):
+class AxisLimits(StrictModel):
     """Allowed interval of one coordinate, in plate coordinates."""
 
     low: Millimetres
     high: Millimetres
 
     @rule
-    def _ordered(self) -> Axis:
+    def _ordered(self) -> AxisLimits:
         if not self.low < self.high:
             raise ValueError("'low' must be below 'high'")
         return self
@@ -64,11 +64,11 @@ class Axis(StrictModel):
 class Workspace(StrictModel):
     """The box that the sensor's centre must stay in, in plate coordinates."""
 
-    x: Axis
-    y: Axis
+    x: AxisLimits
+    y: AxisLimits
 
 
-class Limits(StrictModel):
+class ProtocolLimits(StrictModel):
     """Limits that no trial of this protocol may exceed, checked before anything moves."""
 
     depth: PositiveMillimetres
@@ -122,7 +122,7 @@ class Gates(StrictModel):
     """Left out, reference trials are taken and not compared while collecting."""
 
 
-class References(StrictModel):
+class ReferenceSettings(StrictModel):
     """One condition taken again and again, to see the skin wear and the rig drift."""
 
     every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]

@@ -47,7 +47,7 @@ Number = Annotated[
 ]
 
 
-class Range(StrictModel):
+class LevelRange(StrictModel):
     """Evenly spaced levels, both ends included."""
 
     start: Number = Field(alias="from")
@@ -55,7 +55,7 @@ class Range(StrictModel):
     step: Number
 
     @rule
-    def _whole(self) -> Range:
+    def _whole(self) -> LevelRange:
         if self.step <= 0:
             raise ValueError(f"step = {canonical(self.step)} must be more than 0")
         if self.stop < self.start:
@@ -220,7 +220,7 @@ class Factor(StrictModel):
     """Of all its levels, which are taken over in the canonical unit of its dimension; words have
     none."""
     values: tuple[LevelField, ...] | None = None
-    range: Range | None = None
+    range: LevelRange | None = None
     optional: tuple[LevelField, ...] = ()
     """Levels that the protocol knows but does not take unless they are switched on."""
     changeover: Literal["none", "person"] = "none"

@@ -14,14 +14,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from sliplab.protocols.claims import Choice, Stopping
+from sliplab.protocols.claims import AdaptiveChoice, Stopping
 from sliplab.protocols.conditions import (
     Gates,
-    Limits,
     Maintenance,
     PlateSetup,
-    Recording,
-    References,
+    ProtocolLimits,
+    RecordingSettings,
+    ReferenceSettings,
 )
 from sliplab.protocols.factors import (
     MAX_TRIALS,
@@ -113,15 +113,15 @@ class Collection(StrictModel):
     order: Literal["shuffled", "listed", "adaptive"] = "shuffled"
     """Inside a block; ``adaptive``: the next trials are those that tell most about the claims."""
     stopping: Stopping | None = None
-    choice: Choice | None = None
+    choice: AdaptiveChoice | None = None
     """Of `order: adaptive`; left out, its defaults."""
-    references: References | None = None
+    references: ReferenceSettings | None = None
     plate: PlateSetup | None = None
     motion: tuple[Phase, ...] = Field(json_schema_extra=_or_template)
     """The phases of a trial in order; or a template and its parameters."""
     nuisances: Nuisances | None = None
-    recording: Recording
-    limits: Limits
+    recording: RecordingSettings
+    limits: ProtocolLimits
     gates: Gates = Gates()
     maintenance: Maintenance = Maintenance()
 
@@ -224,9 +224,9 @@ class Collection(StrictModel):
         ]
 
     @property
-    def adaptive(self) -> Choice | None:
+    def adaptive(self) -> AdaptiveChoice | None:
         """How the next trials are chosen; None where the plan says their order."""
-        return (self.choice or Choice()) if self.order == "adaptive" else None
+        return (self.choice or AdaptiveChoice()) if self.order == "adaptive" else None
 
     @rule
     def _stopping_fits(self) -> Iterator[KeyedError]:

@@ -26,7 +26,7 @@ from sliplab.protocols.nuisances import (
 )
 from sliplab.protocols.phases import (
     Approach,
-    Hold,
+    HoldPhase,
     Place,
     PlateMotion,
     Press,
@@ -65,7 +65,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
     (right is +x) during the whole retraction, on one straight path.
     """
     motion, acting = collection.motion, collection.acting
-    holds = [i for i, phase in enumerate(motion) if isinstance(phase, Hold) and i < acting[0]]
+    holds = [i for i, phase in enumerate(motion) if isinstance(phase, HoldPhase) and i < acting[0]]
     approach = next(phase for phase in motion if isinstance(phase, Approach))
     home = Position(0.0, 0.0, -_value(approach.clearance, condition))
     start_xy = (0.0, 0.0)
@@ -86,7 +86,7 @@ def build_program(collection: Collection, condition: Condition) -> Program:
             until = None if phase.force is None else _value(phase.force, condition)
             press = Move("press", at, _value(phase.speed, condition), until_force_n=until)
             steps.append(press)
-        elif isinstance(phase, Hold):
+        elif isinstance(phase, HoldPhase):
             settle = _value(phase.settle, condition)
             if settle:
                 steps.append(Dwell("settle", settle, recorded and index > holds[-1]))
@@ -261,7 +261,7 @@ def _limit_faults(
         base = f"collection.motion[{index}]"
         if isinstance(phase, TwistPhase):
             yield from _check_twist(phase, base, levels, limits)
-        elif not isinstance(phase, (Hold, PlateMotion)):
+        elif not isinstance(phase, (HoldPhase, PlateMotion)):
             yield from at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
             yield from at_most(

@@ -82,7 +82,7 @@ class Tap(_Nuisance):
         )
 
 
-class Vibration(_Nuisance):
+class VibrationNuisance(_Nuisance):
     """The sensor shakes against the plate, its frequency rising evenly in octaves, over and over.
 
     Its peak speed is the same at every frequency f, so the amplitude is speed / (2 pi f).
@@ -139,7 +139,7 @@ class Regrasp(_Nuisance):
     every: PositiveSeconds = Decimal(3)
 
 
-class Flicker(_Nuisance):
+class FlickerNuisance(_Nuisance):
     """Lamps on the mains, with light that gets into the sensor."""
 
     scales = "share"
@@ -224,11 +224,11 @@ class Warmth(_Nuisance):
 
 AnyNuisance = (
     Tap
-    | Vibration
+    | VibrationNuisance
     | ArmMotion
     | Rotation
     | Regrasp
-    | Flicker
+    | FlickerNuisance
     | Brush
     | LostPackets
     | HotPixels
@@ -240,11 +240,11 @@ register_tags(*(get_args(m.model_fields["kind"].annotation)[0] for m in get_args
 SHIPPED: dict[str, AnyNuisance] = {
     "tap_table": Tap(kind="tap", on="table", distance="20 um", ring="60 Hz"),
     "tap_arm": Tap(kind="tap", on="arm", distance="100 um", ring="15 Hz"),
-    "vibration": Vibration(kind="vibration", speed="0.5 mm/s"),
+    "vibration": VibrationNuisance(kind="vibration", speed="0.5 mm/s"),
     "arm_motion": ArmMotion(kind="arm_motion", distance="30 um"),
     "rotation": Rotation(kind="rotation", angle="0.2 deg"),
     "regrasp": Regrasp(kind="regrasp", distance="300 um"),
-    "flicker": Flicker(kind="flicker", share="3 %"),
+    "flicker": FlickerNuisance(kind="flicker", share="3 %"),
     "brush": Brush(kind="brush", force="0.05 N"),
     "lost_packets": LostPackets(kind="lost_packets", duration="10 ms"),
     "hot_pixels": HotPixels(kind="hot_pixels", pixels=50, rate="10 Hz"),

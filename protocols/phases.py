@@ -52,7 +52,7 @@ class Press(StrictModel):
         return self
 
 
-class Hold(StrictModel):
+class HoldPhase(StrictModel):
     """Standing still: `settle` passes first, then `duration`, which may be recorded."""
 
     phase: Literal["hold"]
@@ -176,7 +176,7 @@ register_tags(*_PHASES)
 Phase = Annotated[
     Approach
     | Press
-    | Hold
+    | HoldPhase
     | Slide
     | Retract
     | TwistPhase

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
 
-from sliplab.protocols.claims import Choice, Stopping
+from sliplab.protocols.claims import AdaptiveChoice, Stopping
 from sliplab.protocols.factors import Level
 from sliplab.protocols.model import Collection
 from sliplab.protocols.shown import plural
@@ -22,7 +22,7 @@ class _Grid:
     conditions: int
     stretches: int
     stopping: Stopping
-    choice: Choice | None
+    choice: AdaptiveChoice | None
 
     def ends(self, repetitions: int, most: int | None) -> list[int]:
         """Return how many measured trials there are at the end of each round, the first always."""

@@ -93,7 +93,7 @@ class Windows(StrictModel):
         return self.polarities * (self.taxels or 1)
 
 
-class Samples(StrictModel):
+class SampleSettings(StrictModel):
     """Windows per class and trial."""
 
     per_class: int = Field(default=50, ge=1, le=10_000)
@@ -136,7 +136,7 @@ class Split(StrictModel):
         return self
 
 
-class Network(StrictModel):
+class NetworkSettings(StrictModel):
     """The spiking network: two convolutions, two fully connected layers, IAF neurons."""
 
     conv1_channels: int = Field(default=8, ge=1, le=256)
@@ -207,7 +207,7 @@ class Training(StrictModel):
         return seeds
 
 
-class Comparison(StrictModel):
+class ComparisonSettings(StrictModel):
     """Other detectors compared with the paper's rule, at equal rates of false early detections."""
 
     rates: tuple[Annotated[float, Field(le=1)], ...] = (0.005, 0.01, 0.02)
@@ -250,7 +250,7 @@ class Detection(StrictModel):
     for each of a class's output neurons."""
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)
     """Share of trials that a choice may leave false early, and as many missed."""
-    compare: Comparison | None = Comparison()
+    compare: ComparisonSettings | None = ComparisonSettings()
     """Other detectors to compare with this rule (docs/detection.md); null leaves them out."""
 
     @field_validator("smoothing_grid", "margin_grid")
@@ -279,9 +279,9 @@ class AnalysisSettings(StrictModel):
     the first seed; the report compares its figures with the others."""
     labelling: Labelling = Labelling()
     windows: Windows = Windows()
-    samples: Samples = Samples()
+    samples: SampleSettings = SampleSettings()
     split: Split = Split()
-    network: Network = Network()
+    network: NetworkSettings = NetworkSettings()
     training: Training = Training()
     detection: Detection = Detection()
 
@@ -293,7 +293,7 @@ class AnalysisSettings(StrictModel):
     @model_validator(mode="after")
     def _spikes(self) -> AnalysisSettings:
         """Margins in spikes scale with the number of output neurons per class."""
-        factor = self.network.outputs_per_class / Network().outputs_per_class
+        factor = self.network.outputs_per_class / NetworkSettings().outputs_per_class
         usual, rule = Training(), Detection()
         changes: tuple[tuple[str, StrictModel, dict[str, Any]], ...] = (
             ("training", self.training, {"gain": usual.gain / factor}),

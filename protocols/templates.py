@@ -33,7 +33,7 @@ KEY = "collection.motion"
 _PHASE = re.compile(r"collection\.motion\[(\d+)\]((?:\.\w+)*)")
 
 
-class Parameter(StrictModel):
+class TemplateParameter(StrictModel):
     """A parameter of a template: its unit (words have none), and its value if none is given."""
 
     unit: str | None = None
@@ -44,7 +44,7 @@ class Template(StrictModel):
     """A motion with parameters."""
 
     template: Literal[1]
-    parameters: dict[str, Parameter]
+    parameters: dict[str, TemplateParameter]
     motion: tuple[dict[str, Any], ...]
 
 

@@ -73,14 +73,14 @@ TABLE: tuple[Unit, ...] = tuple(
 
 
 @dataclass
-class _Known:
+class _KnownUnits:
     """Units by symbol, and why units of packages cannot be used; None before they were loaded."""
 
     units: dict[str, Unit] = field(default_factory=lambda: {each.symbol: each for each in TABLE})
     faults: list[str] | None = None
 
 
-_known = _Known()
+_known = _KnownUnits()
 
 
 def find_unit(symbol: str) -> Unit | None:

@@ -182,7 +182,7 @@ def _is_number(value: Any) -> bool:
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-class Document(dict[str, Any]):
+class YamlDocument(dict[str, Any]):
     """A YAML mapping as read, with the text of each scalar by its key.
 
     Attributes:
@@ -397,7 +397,7 @@ def _at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)
 
 
-def parse_yaml(text: str, path: str | Path) -> Document:
+def parse_yaml(text: str, path: str | Path) -> YamlDocument:
     """YAML text as a mapping, floats as decimals.
 
     Raises:
@@ -409,7 +409,7 @@ def parse_yaml(text: str, path: str | Path) -> Document:
     return document
 
 
-def parse_leniently(text: str, path: str | Path) -> Document:
+def parse_leniently(text: str, path: str | Path) -> YamlDocument:
     """YAML text as `parse_yaml` reads it, for `validate`: it raises the document's faults, too.
 
     Raises:
@@ -434,7 +434,7 @@ def parse_leniently(text: str, path: str | Path) -> Document:
             raise InputError.joined(builder.faults)
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(path, "", None, f"holds {found} instead of a mapping (key: value)")
-    return Document(data, builder.written, builder.faults)
+    return YamlDocument(data, builder.written, builder.faults)
 
 
 def mask_secrets(text: str) -> str:
@@ -485,7 +485,7 @@ def validate(
     Raises:
         InputError: all that is wrong with it.
     """
-    document = data if isinstance(data, Document) else Document(data, {})
+    document = data if isinstance(data, YamlDocument) else YamlDocument(data, {})
     unread = [fault.key for fault in document.faults]
     found: list[KeyedError] = []
     checked: Sequence[KeyedError] = ()
@@ -514,7 +514,7 @@ def validate(
     return made
 
 
-def _as_written(document: Document, fault: KeyedError) -> object:
+def _as_written(document: YamlDocument, fault: KeyedError) -> object:
     return fault.value if fault.value is None else document.written.get(fault.key) or fault.value
 
 

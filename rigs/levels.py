@@ -27,7 +27,7 @@ HIGHEST = 3
 
 
 @dataclass(frozen=True)
-class Slide:
+class SlideParameters:
     """Parameters that determine the onsets of one slide."""
 
     depth_mm: float
@@ -37,7 +37,7 @@ class Slide:
 
 
 @dataclass(frozen=True)
-class Choice:
+class LevelChoice:
     """A level and the reason for it."""
 
     level: int
@@ -49,21 +49,21 @@ class Choice:
         return f"L{self.level}"
 
 
-def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
+def choose_level(rig: RigFile, plan: Plan) -> LevelChoice | None:
     """Choose the physics level for a plan on a simulated rig; None on a real one."""
     if not rig.simulated:
         return None
     stated = rig.scene.scene.level
     if stated != "auto":
-        return Choice(int(stated[1]), "set by the rig file (mock.scene.level)")
+        return LevelChoice(int(stated[1]), "set by the rig file (mock.scene.level)")
     slides = slides_of(plan)
     if not slides and plan.protocol.collection.plate is None:
-        return Choice(
+        return LevelChoice(
             HIGHEST,
             "onsets are compared between levels for slides only, so no effect is left out",
         )
     if not slides:
-        return Choice(
+        return LevelChoice(
             HIGHEST,
             "onsets under a falling plate have no closed form at the higher levels, so no effect "
             "is left out",
@@ -80,7 +80,7 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
         level = HIGHEST
     last, far = differences[-1]
     against = "stays within" if level == last else "is beyond"
-    return Choice(
+    return LevelChoice(
         level,
         f"L{last} against L{last + 1} moves the first slip by {far[0] * 1e3:.0f} ms and the "
         f"centre's by {far[1] * 1e3:.0f} ms on average, which {against} what two seeds differ "
@@ -130,9 +130,9 @@ def slip_expected(rig: RigFile, plan: Plan) -> SlipExpected | None:
     }
 
 
-def slides_of(plan: Plan) -> list[Slide]:
+def slides_of(plan: Plan) -> list[SlideParameters]:
     """Return the distinct slides of a plan, in order of first appearance."""
-    found: dict[Slide, None] = {}
+    found: dict[SlideParameters, None] = {}
     for trial in plan:
         slide = _slide(plan.program(trial))
         if slide is not None:
@@ -140,7 +140,7 @@ def slides_of(plan: Plan) -> list[Slide]:
     return list(found)
 
 
-def _slide(program: Program) -> Slide | None:
+def _slide(program: Program) -> SlideParameters | None:
     depth, press, settled = 0.0, 1.0, 0.0
     for step in program.steps:
         if isinstance(step, Move) and step.phase == "press":
@@ -148,12 +148,12 @@ def _slide(program: Program) -> Slide | None:
         elif isinstance(step, Dwell):
             settled += step.seconds
         elif isinstance(step, Move) and step.phase == "slide":
-            return Slide(depth, step.speed_mm_s, press, settled)
+            return SlideParameters(depth, step.speed_mm_s, press, settled)
     return None
 
 
 def expected_onsets(
-    mock: MockSettings, slides: list[Slide], level: int, grip: F64 | None = None
+    mock: MockSettings, slides: list[SlideParameters], level: int, grip: F64 | None = None
 ) -> F64:
     """Return the first slip and the slip of the centre, s after the start of a slide, (k, 2)."""
     scene = mock.scene
@@ -177,7 +177,7 @@ def expected_onsets(
     return np.stack([onsets.min(axis=-1), onsets[..., 0]], axis=-1)
 
 
-def _seeds_differ(mock: MockSettings, slides: list[Slide]) -> F64:
+def _seeds_differ(mock: MockSettings, slides: list[SlideParameters]) -> F64:
     """Mean difference of both onsets between two seeds, whose friction at the tips varies."""
     variation, count = mock.scene.friction.path_variation, sum(mock.scene.skin.ring_counts)
     onsets = []

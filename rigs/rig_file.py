@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
-from sliplab.protocols.nuisances import Flicker
+from sliplab.protocols.nuisances import FlickerNuisance
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move, Twist
 from sliplab.protocols.quantity import (
@@ -71,7 +71,7 @@ class RigLimits(StrictModel):
     sensor."""
 
 
-class Skin(StrictModel):
+class PapillaLayout(StrictModel):
     """The sensor's papillae by ring, from the centre outwards."""
 
     serial: str = Field(min_length=1, max_length=40)
@@ -157,7 +157,7 @@ class RigFile(StrictModel):
     """Serial number of the event camera and its housing."""
     calibration: Calibration
     limits: RigLimits
-    skin: Skin
+    skin: PapillaLayout
     cameras: tuple[Literal["events", "frames"], ...] = ("events", "frames")
     """Cameras that the rig has: `events` in the sensor, `frames` through the plate."""
     frame_camera: FrameCameraSpec
@@ -670,7 +670,7 @@ def _check_flicker(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     if not rig.simulated or rig.scene.event_camera.cutoff_hz == 0:
         return
     for trial in plan:
-        if any(isinstance(each, Flicker) for each in plan.program(trial).nuisances):
+        if any(isinstance(each, FlickerNuisance) for each in plan.program(trial).nuisances):
             yield InputError(
                 file,
                 "mock.event_camera.cutoff_hz",

@@ -18,7 +18,7 @@ import yaml
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shipped import find_shipped, neighbours, shipped_files
 from sliplab.protocols.shown import did_you_mean
-from sliplab.protocols.yaml_file import Document, parse_leniently, read_text
+from sliplab.protocols.yaml_file import YamlDocument, parse_leniently, read_text
 
 KEY = "extends"
 _DEEPEST = 8
@@ -29,11 +29,11 @@ class RigSource:
     """A rig file as read, with the files that it extends."""
 
     path: Path
-    data: Document
+    data: YamlDocument
     """Merged content."""
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
-    parts: tuple[tuple[Path, Document], ...]
+    parts: tuple[tuple[Path, YamlDocument], ...]
     """Each file with its own keys, the requested one first."""
 
     def blame(self, key: str) -> Path:
@@ -70,7 +70,7 @@ def read_rig(path: Path) -> RigSource:
     Raises:
         InputError: a file cannot be read, extends itself, or has a chain of more than 8 files.
     """
-    parts: list[tuple[Path, Document]] = []
+    parts: list[tuple[Path, YamlDocument]] = []
     text, here = read_text(path, "rig file"), path
     own = text
     while True:
@@ -102,7 +102,7 @@ def read_rig(path: Path) -> RigSource:
         names = " on ".join(file.name for file, _ in parts)
         text = f"# Merged: {names}\n" + rig_yaml(merged)
     written = {key: each for _, data in reversed(parts) for key, each in data.written.items()}
-    return RigSource(path, Document(merged, written, faults), text, tuple(parts))
+    return RigSource(path, YamlDocument(merged, written, faults), text, tuple(parts))
 
 
 def _parent_file(here: Path, parent: str) -> Path:

@@ -44,7 +44,7 @@ from sliplab.rigs.mock.further_settings import (
     FurtherFrameCamera,
     Thermometer,
 )
-from sliplab.rigs.mock.settings import Clocks, ForceSensor
+from sliplab.rigs.mock.settings import ClockErrors, MockForceSensorSettings
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 RESERVED = frozenset(
@@ -67,7 +67,7 @@ MOST = 16
 """Further devices of a rig: a limit for people's typing errors, not of the store."""
 
 
-class _Stream(StrictModel):
+class _StreamSettings(StrictModel):
     """What every further device has."""
 
     GRADES: ClassVar[tuple[StreamGrade, ...]]
@@ -130,7 +130,7 @@ class _Stream(StrictModel):
         return None if device is None else find_driver(device.driver, self.DRIVERS)
 
 
-class EventStream(_Stream):
+class EventStream(_StreamSettings):
     """A further event camera, on the sync line as the first one."""
 
     GRADES = ("trigger input",)
@@ -143,7 +143,7 @@ class EventStream(_Stream):
     """The simulated camera; not for `devices`."""
 
 
-class FrameStream(_Stream):
+class FrameStream(_StreamSettings):
     """A further frame camera."""
 
     GRADES = ("hardware trigger", "device time stamps", "host arrival")
@@ -187,7 +187,7 @@ class FrameStream(_Stream):
         return self
 
 
-class ScalarStream(_Stream):
+class ScalarStream(_StreamSettings):
     """A sensor of one quantity, such as a temperature; its readings are timed by arrival."""
 
     GRADES = ("host arrival",)
@@ -207,7 +207,7 @@ class ScalarStream(_Stream):
         return unit
 
 
-class ForceStream(_Stream):
+class ForceStream(_StreamSettings):
     """A further force/torque sensor. It neither limits the arm nor ends a press."""
 
     GRADES = ("host time", "arm clock")
@@ -216,7 +216,7 @@ class ForceStream(_Stream):
 
     kind: Literal["wrench"]
     device: Annotated[DriverSettings, OfKind(ForceSensorDriver)] | None = None
-    mock: ForceSensor | None = None
+    mock: MockForceSensorSettings | None = None
     """The simulated sensor, which feels the same load as the first one."""
 
 
@@ -234,7 +234,7 @@ class _ByKind(ChosenModel):
 
     def read(self, value: Any) -> Stream:
         """Return the settings in `value`, checked by the model of their kind."""
-        if isinstance(value, _Stream):
+        if isinstance(value, _StreamSettings):
             return value  # type: ignore[return-value]
         if not isinstance(value, dict):
             raise ValueError("must be a mapping (key: value)")
@@ -256,7 +256,7 @@ Streams = Annotated[dict[str, Annotated[Stream, _ByKind()]], Field(max_length=MO
 
 
 def stream_faults(
-    streams: Mapping[str, Stream], rig_driver: str, clocks: Clocks | None = None
+    streams: Mapping[str, Stream], rig_driver: str, clocks: ClockErrors | None = None
 ) -> Iterator[KeyedError]:
     """Return what is wrong with names, and what each device lacks that the rig's driver needs.
 

@@ -28,7 +28,7 @@ class FittedValue(StrictModel):
     """The pilot says more of it than was assumed; the rest keep the value that was assumed."""
 
 
-class Range(StrictModel):
+class ConditionRange(StrictModel):
     """Least and most of a condition in the pilot."""
 
     least: Number
@@ -48,8 +48,8 @@ class TwinRecord(StrictModel):
     """The pilot itself was simulated."""
     fitted: date
     method: str
-    depth_mm: Range
-    speed_mm_s: Range
+    depth_mm: ConditionRange
+    speed_mm_s: ConditionRange
     parameters: dict[str, FittedValue]
     """By key in the section `mock:`."""
     misfits: tuple[str, ...] = ()

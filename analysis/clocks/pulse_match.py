@@ -58,7 +58,7 @@ class Match:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _LocalFit:
     """Fit of a piece of the device's train: y = x + lag + drift (x - centre) near centre."""
 
     lag: float
@@ -117,7 +117,7 @@ def _refuse_ambiguous(ratio: float) -> None:
         )
 
 
-def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_Place], float]:
+def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_LocalFit], float]:
     """Fit a piece of the train `x` into `y`; also the second correlation peak over the first.
 
     There is more than one place only where a handful fit equally well.
@@ -134,7 +134,7 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
     y_bins = np.zeros(int((y[-1] - y_start) / width) + 1, np.float32)
     y_bins[((y - y_start) / width).astype(np.int64)] = 1.0
     length = _PIECE_TICKS * tick
-    best: list[_Place] = []
+    best: list[_LocalFit] = []
     least = np.inf
     # by rank, not by time: a stray stamp far away must not decide where the pieces lie
     for rank in _spread(_PIECES):
@@ -148,7 +148,7 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
         if ratio < least:
             least = ratio
             best = [
-                _Place(lag + y_start - centre, drift, centre, half)
+                _LocalFit(lag + y_start - centre, drift, centre, half)
                 for lag, drift in zip(lags, drifts, strict=True)
             ]
         if ratio < 0.8:
@@ -219,7 +219,7 @@ def _correlate(
     )
 
 
-def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
+def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _LocalFit:
     """Find the only pulse with the marker's silence after it, and one as long before it."""
     found = []
     for name, train in (("device", x), ("reference", y)):
@@ -249,10 +249,10 @@ def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
     half = 0.5 * silence + MIN_PULSES * tick
     drift = step_y / step_x - 1
     centre = begin_x + half
-    return _Place(begin_y - begin_x + drift * half, drift, centre, half)
+    return _LocalFit(begin_y - begin_x + drift * half, drift, centre, half)
 
 
-def _follow(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[Ints, Ints]:
+def _follow(x: Floats, y: Floats, place: _LocalFit, tick: float) -> tuple[Ints, Ints]:
     """Pairs of the whole train, from a piece of it outwards."""
     slope, level = _first_line(x, y, place, tick)
     centre, half = place.centre, place.half
@@ -292,7 +292,7 @@ def _follow(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[Ints, Int
     return i[once], j[once]
 
 
-def _first_line(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[float, float]:
+def _first_line(x: Floats, y: Floats, place: _LocalFit, tick: float) -> tuple[float, float]:
     """y - x = level + slope (x - centre) in a piece: the mode of differences, then Theil-Sen."""
     first, last = np.searchsorted(x, [place.centre - place.half, place.centre + place.half])
     piece = x[first : last + 1]

@@ -34,7 +34,7 @@ from sliplab.protocols.shown import plural
 from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTiming, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
-from sliplab.storage.schema.trial import Clocks, DeviceRecord, StreamRecord
+from sliplab.storage.schema.trial import DeviceRecord, StreamRecord, TrialClockMaps
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, WrenchChunk
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
@@ -163,7 +163,7 @@ class TrialSync:
     pieces: dict[str, list[DeviceSync | str]]
     streams: frozenset[str] = frozenset()
 
-    def record(self) -> Clocks:
+    def record(self) -> TrialClockMaps:
         """Return the part of the trial's record."""
         known: dict[str, Any] = {"reference": "sync box", "code": self.code}
         records = {name: device.record() for name, device in self.devices.items()}
@@ -177,7 +177,7 @@ class TrialSync:
                 name: [part if isinstance(part, str) else part.record() for part in parts]
                 for name, parts in self.pieces.items()
             }
-        return Clocks(**known)
+        return TrialClockMaps(**known)
 
     def against_events_ns(self, device: str) -> float | None:
         """Uncertainty of events against another device, both maps together; None if unknown."""

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.detectors import (
-    Detector,
-    Evidence,
-    Labelled,
+    EvidenceDetector,
     Learned,
     Levels,
     Predictions,
     Smoothing,
+    TrialWithSlip,
     Tuned,
+    WindowEvidence,
     decide,
     first_above,
     learn,
@@ -38,7 +38,7 @@ from sliplab.analysis.detectors.onset_references import (
     judge_by_reference,
 )
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.protocols.settings import Comparison, Detection, Windows
+from sliplab.protocols.settings import ComparisonSettings, Detection, Windows
 from sliplab.storage.schema.evaluation import (
     CurvePoint,
     DetectorComparison,
@@ -54,17 +54,17 @@ from sliplab.storage.schema.evaluation import (
 
 
 @dataclass(frozen=True)
-class Judged:
+class TrialEvidence:
     """A trial's evidence with its label's onsets, and those by other references."""
 
-    evidence: Evidence
+    evidence: WindowEvidence
     slip: TrueSlip
     references: References = field(default_factory=dict)
 
 
-def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
+def judge(detector: EvidenceDetector, trials: Sequence[TrialWithSlip]) -> list[TrialEvidence]:
     """Evidence of a detector on labelled trials."""
-    return [Judged(detector.evidence(t.predictions), t.slip, t.references) for t in trials]
+    return [TrialEvidence(detector.evidence(t.predictions), t.slip, t.references) for t in trials]
 
 
 def allowed_early(rate: float, trials: int) -> int:
@@ -72,7 +72,7 @@ def allowed_early(rate: float, trials: int) -> int:
     return int(np.floor(rate * trials + 1e-9))
 
 
-def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> Levels:
+def set_levels(trials: Sequence[TrialEvidence], allowed: int, false_early_ns: int) -> Levels:
     """The lowest levels at which at most `allowed` trials are false early, for either onset.
 
     A level is the evidence that the trial after the allowed ones had before its onset; so it is
@@ -105,13 +105,15 @@ def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> L
     return Levels(incipient, level(highest))
 
 
-def _highest(values: Any, evidence: Evidence, start: int, before_ns: int) -> float:
+def _highest(values: Any, evidence: WindowEvidence, start: int, before_ns: int) -> float:
     """The highest value of windows from `start` on that end before a moment; -inf without any."""
     stop = int(np.searchsorted(evidence.end_ns, before_ns, side="left"))
     return float(values[start:stop].max(initial=-np.inf))
 
 
-def outcomes(trials: Sequence[Judged], levels: Levels, false_early_ns: int) -> list[TrialLatency]:
+def outcomes(
+    trials: Sequence[TrialEvidence], levels: Levels, false_early_ns: int
+) -> list[TrialLatency]:
     """Each trial's detections against its label's onsets."""
     return [score_trial(decide(t.evidence, levels), t.slip, false_early_ns) for t in trials]
 
@@ -143,9 +145,9 @@ class Parts:
     """Trials with both onsets: training ones in consecutive windows, the others at the finer
     stride."""
 
-    train: Sequence[Labelled]
-    validation: Sequence[Labelled]
-    test: Sequence[Labelled]
+    train: Sequence[TrialWithSlip]
+    validation: Sequence[TrialWithSlip]
+    test: Sequence[TrialWithSlip]
 
 
 def compare(
@@ -188,7 +190,7 @@ def compare(
     )
 
 
-def thinned(trial: Labelled, every: int) -> Labelled:
+def thinned(trial: TrialWithSlip, every: int) -> TrialWithSlip:
     """A trial with each `every`-th of its windows, the first one among them."""
     predictions = trial.predictions
     kept = Predictions(
@@ -217,7 +219,7 @@ def tuned(
 
 
 def _quickest(
-    judged: Mapping[int, Sequence[Judged]], allowed: int, tolerance: int
+    judged: Mapping[int, Sequence[TrialEvidence]], allowed: int, tolerance: int
 ) -> tuple[int, Levels]:
     """Of several choices of a detector the one that validation trials find quickest."""
     ranked = []
@@ -232,7 +234,7 @@ def _quickest(
 
 def _detectors(
     learned: Learned, windows: Windows, settings: Detection, stride_ms: int
-) -> dict[str, dict[int, Detector]]:
+) -> dict[str, dict[int, EvidenceDetector]]:
     """Detectors by name; where there are several, the validation trials choose, by the number."""
     ours = learned.detectors(stride_ms / windows.length_ms)
     return {
@@ -243,15 +245,15 @@ def _detectors(
 
 
 def _scores(
-    judged: Mapping[int, tuple[list[Judged], list[Judged]]],
+    judged: Mapping[int, tuple[list[TrialEvidence], list[TrialEvidence]]],
     settings: Detection,
-    asked: Comparison,
+    asked: ComparisonSettings,
 ) -> tuple[tuple[DetectorRate, ...], tuple[CurvePoint, ...]]:
     tolerance = round(settings.false_early_ms * 1e6)
     trials = len(next(iter(judged.values()))[0])
-    known: dict[int, _Best] = {}
+    known: dict[int, _AtRate] = {}
 
-    def at(allowed: int) -> _Best:
+    def at(allowed: int) -> _AtRate:
         if allowed not in known:
             known[allowed] = _best(judged, allowed, tolerance)
         return known[allowed]
@@ -274,7 +276,7 @@ def _scores(
 
 
 @dataclass(frozen=True)
-class _Best:
+class _AtRate:
     """One detector at one rate."""
 
     choice: int
@@ -285,8 +287,10 @@ class _Best:
 
 
 def _best(
-    judged: Mapping[int, tuple[list[Judged], list[Judged]]], allowed: int, tolerance: int
-) -> _Best:
+    judged: Mapping[int, tuple[list[TrialEvidence], list[TrialEvidence]]],
+    allowed: int,
+    tolerance: int,
+) -> _AtRate:
     """One detector at one rate."""
     validations = {key: validation for key, (validation, _) in judged.items()}
     key, levels = _quickest(validations, allowed, tolerance)
@@ -296,11 +300,11 @@ def _best(
     plain = {name: _plain(value) for name, value in vars(levels).items()}
     tested = [Decided(decide(t.evidence, levels), t.references, tolerance) for t in judged[key][1]]
     figures = judge_by_reference(tested)
-    return _Best(key, DetectorLevels(**plain), of_validation, of_test, figures)
+    return _AtRate(key, DetectorLevels(**plain), of_validation, of_test, figures)
 
 
 def _summary(
-    trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
+    trials: Sequence[TrialEvidence], scored: Sequence[TrialLatency], levels: Levels
 ) -> DetectorTrials:
     early = sum(trial.false_early_incipient for trial in scored)
     low, high = exact_interval(early, len(scored))

@@ -19,7 +19,7 @@ from scipy.special import log_softmax
 
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import References
-from sliplab.analysis.detectors.smoothing_rule import Found, lead_of
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets, lead_of
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
 from sliplab.storage.kernels import njit
 
@@ -48,7 +48,7 @@ RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
-class Chain:
+class StateChain:
     """States in their only order; the last is never left.
 
     Attributes:
@@ -69,7 +69,7 @@ class Chain:
         return len(self.leave) + 1
 
 
-def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
+def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> StateChain:
     """The chain of labelled trials: how often each state was left, by the windows spent in it.
 
     The share of the windows after which a state was left is the likeliest value; one departure in
@@ -92,10 +92,10 @@ def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
         spent += np.bincount(trial, minlength=states)[:-1]
         # a state between two windows was passed through without its own window
         left[trial[0] : trial[-1]] += 1
-    return Chain((left + 1) / (np.maximum(spent, left) + 2))
+    return StateChain((left + 1) / (np.maximum(spent, left) + 2))
 
 
-def forward(chain: Chain, log_likelihood: FloatArray) -> FloatArray:
+def forward(chain: StateChain, log_likelihood: FloatArray) -> FloatArray:
     """The states' log probabilities given all windows up to each one.
 
     The chain is in its first state before the first window. Within one window it moves on by one
@@ -119,14 +119,14 @@ def forward(chain: Chain, log_likelihood: FloatArray) -> FloatArray:
     return _advanced(chain, _first_state(chain), log_likelihood)
 
 
-def _first_state(chain: Chain) -> FloatArray:
+def _first_state(chain: StateChain) -> FloatArray:
     """Return the log probabilities before the first window, float64 (states,)."""
     belief = np.full(chain.states, -np.inf)
     belief[0] = 0.0
     return belief
 
 
-def _advanced(chain: Chain, belief: FloatArray, log_likelihood: FloatArray) -> FloatArray:
+def _advanced(chain: StateChain, belief: FloatArray, log_likelihood: FloatArray) -> FloatArray:
     """Return `forward` from `belief` on, which becomes that after the last window."""
     out = np.empty(log_likelihood.shape)
     stay = np.append(np.log1p(-chain.leave), 0.0)
@@ -258,7 +258,7 @@ def fit_histograms(
 
 
 @dataclass(frozen=True)
-class Logistic:
+class BalancedLogistic:
     """Multinomial logistic regression with all classes weighing the same.
 
     Attributes:
@@ -281,7 +281,9 @@ class Logistic:
         return np.asarray(log_softmax(linear, axis=1))
 
 
-def fit_logistic(features: Array, labels: npt.NDArray[np.integer], classes: int) -> Logistic:
+def fit_logistic(
+    features: Array, labels: npt.NDArray[np.integer], classes: int
+) -> BalancedLogistic:
     """The regression, by L-BFGS from zero: convex, so the result repeats.
 
     Minimises the cross-entropy, averaged within each class that has windows and then over these,
@@ -298,7 +300,7 @@ def fit_logistic(features: Array, labels: npt.NDArray[np.integer], classes: int)
     raw = np.asarray(features, np.float64)
     if not len(raw):
         empty = np.zeros(raw.shape[1])
-        return Logistic(np.zeros((1 + raw.shape[1], classes)), empty, empty + 1)
+        return BalancedLogistic(np.zeros((1 + raw.shape[1], classes)), empty, empty + 1)
     mean, spread = raw.mean(axis=0), raw.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     x = np.concatenate([np.ones((len(raw), 1)), (raw - mean) / scale], axis=1)
@@ -317,7 +319,7 @@ def fit_logistic(features: Array, labels: npt.NDArray[np.integer], classes: int)
         return float(loss), gradient.ravel()
 
     found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
-    return Logistic(np.asarray(found.x).reshape(shape), mean, scale)
+    return BalancedLogistic(np.asarray(found.x).reshape(shape), mean, scale)
 
 
 def _check(features: Array, labels: npt.NDArray[np.integer], classes: int) -> npt.NDArray[np.int64]:
@@ -358,7 +360,7 @@ class Predictions:
 
 
 @dataclass(frozen=True)
-class Labelled:
+class TrialWithSlip:
     """A trial with its true slip, and that by other references, on the time line of its windows."""
 
     predictions: Predictions
@@ -372,7 +374,7 @@ class Labelled:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class WindowEvidence:
     """Output of a detector for one trial; no value depends on a later window.
 
     Attributes:
@@ -403,10 +405,10 @@ class Running(Protocol):
         """Note that incipient slip was detected in the last window."""
 
 
-class Detector(Protocol):
+class EvidenceDetector(Protocol):
     """Evidence that slip has begun."""
 
-    def evidence(self, predictions: Predictions) -> Evidence:
+    def evidence(self, predictions: Predictions) -> WindowEvidence:
         """The evidence of one trial."""
 
     def begin(self) -> Running:
@@ -422,17 +424,17 @@ class Smoothing:
 
     width: int
 
-    def evidence(self, predictions: Predictions) -> Evidence:
-        """See `Detector`."""
+    def evidence(self, predictions: Predictions) -> WindowEvidence:
+        """See `EvidenceDetector`."""
         gross = lead_of(predictions.counts, self.width, GROSS)
-        return Evidence(
+        return WindowEvidence(
             predictions.end_ns,
             lead_of(predictions.counts, self.width, INCIPIENT),
             lambda first: gross,
         )
 
     def begin(self) -> Running:
-        """See `Detector`."""
+        """See `EvidenceDetector`."""
         return _RunningSmoothing(self.width)
 
 
@@ -478,17 +480,17 @@ class Reading:
 class Filter:
     """The hidden Markov filter; the evidence is log odds."""
 
-    chain: Chain
+    chain: StateChain
     reading: Reading
 
-    def evidence(self, predictions: Predictions) -> Evidence:
-        """See `Detector`."""
+    def evidence(self, predictions: Predictions) -> WindowEvidence:
+        """See `EvidenceDetector`."""
         belief = forward(self.chain, self.reading.log(predictions))
         gross = log_odds(belief, GROSS)
-        return Evidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
+        return WindowEvidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
 
     def begin(self) -> Running:
-        """See `Detector`."""
+        """See `EvidenceDetector`."""
         return _RunningFilter(self)
 
 
@@ -513,8 +515,8 @@ class Cusum:
 
     reading: Reading
 
-    def evidence(self, predictions: Predictions) -> Evidence:
-        """See `Detector`."""
+    def evidence(self, predictions: Predictions) -> WindowEvidence:
+        """See `EvidenceDetector`."""
         log = self.reading.log(predictions)
         ratio = log[:, GROSS] - log[:, INCIPIENT]
 
@@ -523,10 +525,12 @@ class Cusum:
             out[first + 1 :] = cusum(ratio[first + 1 :])
             return out
 
-        return Evidence(predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after)
+        return WindowEvidence(
+            predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after
+        )
 
     def begin(self) -> Running:
-        """See `Detector`."""
+        """See `EvidenceDetector`."""
         return _RunningCusum(self.reading)
 
 
@@ -560,18 +564,18 @@ class Tuned:
     """A detector with the levels that validation trials set."""
 
     name: str
-    detector: Detector
+    detector: EvidenceDetector
     levels: Levels
 
 
-def decide(evidence: Evidence, levels: Levels) -> Found:
+def decide(evidence: WindowEvidence, levels: Levels) -> DetectedOnsets:
     """Return incipient, then gross slip, each at the end of the window that detected it."""
     first = first_above(evidence.incipient, levels.incipient)
     if first is None:
-        return Found(None, None)
+        return DetectedOnsets(None, None)
     second = first_above(evidence.gross_after(first), levels.gross, first + 1)
     end = evidence.end_ns
-    return Found(int(end[first]), None if second is None else int(end[second]))
+    return DetectedOnsets(int(end[first]), None if second is None else int(end[second]))
 
 
 def first_above(evidence: FloatArray, level: float, start: int = 0) -> int | None:
@@ -602,17 +606,17 @@ class Learned:
         readings: by name, likelihoods of windows of full weight.
     """
 
-    chain: Chain
+    chain: StateChain
     readings: dict[str, Reading]
 
-    def detectors(self, stride_share: float) -> dict[str, Detector]:
+    def detectors(self, stride_share: float) -> dict[str, EvidenceDetector]:
         """A filter and a test for each reading, by name.
 
         Args:
             stride_share: stride over length of the windows that they will read.
         """
         # a state is left as often per second whatever the stride
-        chain = Chain(-np.expm1(stride_share * np.log1p(-self.chain.leave)))
+        chain = StateChain(-np.expm1(stride_share * np.log1p(-self.chain.leave)))
         weighed = {n: replace(r, weight=stride_share) for n, r in self.readings.items()}
         return {
             **{f"hmm {name}": Filter(chain, reading) for name, reading in weighed.items()},
@@ -620,7 +624,7 @@ class Learned:
         }
 
 
-def learn(trials: Sequence[Labelled], length_ns: int, most: int) -> Learned:
+def learn(trials: Sequence[TrialWithSlip], length_ns: int, most: int) -> Learned:
     """Learn from labelled training trials in consecutive windows.
 
     Args:

@@ -17,7 +17,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
@@ -93,7 +93,7 @@ def is_late(found_ns: Any, end_ns: Any) -> Any:
     return (found_ns >= end_ns) & (found_ns != NEVER)
 
 
-def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
+def score_trial(detections: DetectedOnsets, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
     """Judge one trial; see the module.
 
     Args:
@@ -194,7 +194,7 @@ def median_span(
     return low, high
 
 
-class Statistics(TypedDict):
+class LatencyStatistics(TypedDict):
     """Statistics of n values; None where one cannot be computed."""
 
     mean: float | None
@@ -206,7 +206,7 @@ class Statistics(TypedDict):
     n: int
 
 
-def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> Statistics:
+def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> LatencyStatistics:
     """Statistics of the values that are there; None where one cannot be computed.
 
     ``std`` is the sample standard deviation (divisor n - 1), so it needs two values; percentiles
@@ -218,7 +218,9 @@ def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> Stat
     there = np.array([v for v in values if v is not None], np.float64)
     n = len(there)
     if n == 0:
-        return Statistics(mean=None, std=None, median=None, p95=None, min=None, max=None, n=0)
+        return LatencyStatistics(
+            mean=None, std=None, median=None, p95=None, min=None, max=None, n=0
+        )
     return {
         "mean": float(there.mean()),
         "std": float(there.std(ddof=1)) if n > 1 else None,

@@ -36,13 +36,13 @@ UNDECIDED = "undecided"
 
 
 @dataclass(frozen=True)
-class Decision:
+class LiveDecision:
     """Decision on one window. Times on the camera's clock, microseconds.
 
     Attributes:
         number: of the window, from 0; gaps leave numbers out.
         counts: output spikes in the order of `analysis.metrics.classification.CLASSES`.
-        smoothed, valid_class, onset: as `Step`.
+        smoothed, valid_class, onset: as `RuleStep`.
         events: events of the window, all over the sensor and of both polarities.
         last_event_us: the latest of them; None in a window without events.
         by_event: an event ended the window, and not the clock alone.
@@ -92,7 +92,7 @@ class TimedDecision:
         compute_ms: from when the events were read to the decision.
     """
 
-    decision: Decision
+    decision: LiveDecision
     trial_s: float
     phase: str
     latency_ms: float | None
@@ -129,7 +129,7 @@ def state_name(valid_class: int) -> str:
 
 
 @dataclass
-class Losses:
+class StreamFaults:
     """Faults of a live stream that stored trials do not have."""
 
     late: int = 0
@@ -141,7 +141,7 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class Step:
+class RuleStep:
     """Answer of the rule after one more window.
 
     Attributes:
@@ -165,7 +165,7 @@ class LiveRule(Protocol):
 
     width: int
 
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> Step:
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> RuleStep:
         """Take the output spikes, integer (3,), and events of the window after the last one."""
 
     def interrupt(self) -> None:
@@ -191,7 +191,7 @@ class StepDetector:
         self._incipient = self._gross = False
         self.interrupt()
 
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> Step:
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> RuleStep:
         """See `LiveRule`."""
         self._windows += 1
         row = np.asarray(counts).astype(np.int64)
@@ -206,7 +206,7 @@ class StepDetector:
             self._gross, onset = True, CLASSES[GROSS]
         slips = INCIPIENT if incipient > levels.incipient else NO_SLIP
         a, b, c = row.tolist()
-        return Step((a, b, c), GROSS if self._gross else slips, onset)
+        return RuleStep((a, b, c), GROSS if self._gross else slips, onset)
 
     def interrupt(self) -> None:
         """See `LiveRule`."""
@@ -228,7 +228,7 @@ class StepRule:
         self._sum = np.zeros(len(CLASSES), np.int64)
         self._incipient = self._gross = False
 
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int = 0) -> Step:
+    def step(self, counts: npt.NDArray[np.integer[Any]], events: int = 0) -> RuleStep:
         """See `LiveRule`; events do not matter.
 
         Raises:
@@ -246,7 +246,7 @@ class StepRule:
         if len(self._held) == self.width:
             valid = int(winners(self._sum[None], self._lead)[0])
         a, b, c = (self._sum / len(self._held)).tolist()
-        return Step((a, b, c), valid, self._onset(valid))
+        return RuleStep((a, b, c), valid, self._onset(valid))
 
     def interrupt(self) -> None:
         """Reset the windows, as the next one does not follow them; keep the onsets."""
@@ -341,7 +341,7 @@ class LiveDetector:
         self._next = 0
         self._now_us: int | None = None
         self._judged_us: int | None = None
-        self.losses = Losses()
+        self.losses = StreamFaults()
         self._bin(_NO_EVENTS, 0)  # raises where the crop does not fit
 
     def warm_up(self) -> None:
@@ -368,7 +368,7 @@ class LiveDetector:
         """Number of open windows: the detector's memory does not grow with time."""
         return len(self._open)
 
-    def push(self, chunk: EventChunk) -> list[Decision]:
+    def push(self, chunk: EventChunk) -> list[LiveDecision]:
         """Take events; give the decisions of the windows that they end, in order.
 
         Raises:
@@ -386,7 +386,7 @@ class LiveDetector:
             )
         return made
 
-    def advance(self, to_us: int) -> list[Decision]:
+    def advance(self, to_us: int) -> list[LiveDecision]:
         """Advance the clock to `to_us`, up to which all events have arrived; return new decisions.
 
         A time before the latest known one has no effect.
@@ -421,7 +421,7 @@ class LiveDetector:
             self.losses.late += int(np.searchsorted(chunk.t_us, self._judged_us))
         return chunk
 
-    def _push(self, chunk: EventChunk) -> list[Decision]:
+    def _push(self, chunk: EventChunk) -> list[LiveDecision]:
         """Events in order and without a gap among them."""
         self._come_to(int(chunk.t_us[0]))
         last_us = int(chunk.t_us[-1])
@@ -470,7 +470,7 @@ class LiveDetector:
         w = self._windows
         return np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8)
 
-    def _judge(self, number: int, *, by_event: bool) -> Decision:
+    def _judge(self, number: int, *, by_event: bool) -> LiveDecision:
         """Close the first window that is not evaluated, `number`, and return its decision."""
         start_us = self._start(number)
         window = self._opened(number, start_us)
@@ -480,7 +480,7 @@ class LiveDetector:
         self._next = number + 1
         self._judged_us = start_us + self._length_us
         a, b, c = counts.tolist()
-        return Decision(
+        return LiveDecision(
             number=number,
             start_us=start_us,
             end_us=self._judged_us,

@@ -23,7 +23,7 @@ from sliplab.analysis.detectors.latency import (
     slip_of,
     summarise_latency,
 )
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.labels.label_errors import true_onset_ns
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.settings import Detection
@@ -57,7 +57,7 @@ References = Mapping[Name, OnsetReference]
 class Decided:
     """The decisions on one trial, its references, and the tolerance that its protocol asks for."""
 
-    found: Found
+    found: DetectedOnsets
     references: References
     false_early_ns: int
 
@@ -117,7 +117,7 @@ def decisions_of(
     """
     return [
         Decided(
-            Found(row.detected_incipient_ns, row.detected_gross_ns),
+            DetectedOnsets(row.detected_incipient_ns, row.detected_gross_ns),
             references.get((row.campaign, row.trial), {}),
             round(rules[row.campaign].false_early_ms * 1e6),
         )

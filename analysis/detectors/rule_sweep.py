@@ -32,7 +32,7 @@ from sliplab.analysis.detectors.latency import (
 from sliplab.analysis.detectors.smoothing_rule import detect, lead_of
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT
 from sliplab.protocols.settings import Detection
-from sliplab.storage.schema.evaluation import Choice
+from sliplab.storage.schema.evaluation import RuleChoice
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
@@ -204,7 +204,7 @@ def choose_pair(
 
 
 @dataclass(frozen=True)
-class Counted:
+class SpikeCounts:
     """Spike counts int64 (n, 3) and window ends int64 ns (n,) of a trial, and its true slip."""
 
     counts: npt.NDArray[np.int64]
@@ -212,7 +212,7 @@ class Counted:
     slip: TrueSlip
 
 
-def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str) -> Choice:
+def choose_smoothing(trials: Sequence[SpikeCounts], settings: Detection, split: str) -> RuleChoice:
     """The pair of the grid with the lowest median incipient latency within the bound.
 
     Among equals the lower 95th percentile, then fewer false early, then the shorter window, then
@@ -249,7 +249,7 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
         for figures, suffix in ((latency.incipient, ""), (latency.gross, "_gross"))
         for name in ("false_early", "missed", "late")
     }
-    return Choice(
+    return RuleChoice(
         smoothing=int(smoothing),
         margin=-negative,
         split=split,
@@ -260,7 +260,7 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
     )
 
 
-def settled(settings: Detection, choice: Choice | None) -> Detection:
+def settled(settings: Detection, choice: RuleChoice | None) -> Detection:
     """The settings with the chosen smoothing and margin; as they are without a choice."""
     if choice is None:
         return settings

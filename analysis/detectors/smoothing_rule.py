@@ -17,7 +17,7 @@ from sliplab.protocols.settings import Detection
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedOnsets:
     """The onsets that a detector found in one trial.
 
     Attributes:
@@ -32,7 +32,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Detections(Found):
+class Detections(DetectedOnsets):
     """Result of the paper's rule on one trial, and its inputs.
 
     Attributes:

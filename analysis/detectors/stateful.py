@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
 
 
-def stateful_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
+def stateful_spikes(engine: SpikeEngine, x: SparseWindows) -> npt.NDArray[np.uint8]:
     """Return the output spikes of every step of consecutive windows, without resets in between.
 
     Args:

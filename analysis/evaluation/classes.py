@@ -17,7 +17,7 @@ from sliplab.analysis.evaluation.evaluation import STEP
 from sliplab.analysis.evaluation.windows import NAME as WINDOWS_NAME
 from sliplab.analysis.evaluation.windows import STEP as WINDOWS
 from sliplab.analysis.evaluation.windows import compared, seed_scores
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
@@ -26,7 +26,7 @@ from sliplab.analysis.networks.baselines import (
     logistic_cells,
     logistic_slices,
 )
-from sliplab.analysis.networks.models import Model, choose_model, wanted_class_models
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_class_models
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX, TrialRef, by_id
@@ -56,16 +56,16 @@ LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 class ClassJob:
     """Everything that an evaluation depends on, found before anything is computed."""
 
-    labels: Labels
+    labels: StoreLabels
     campaigns: list[Collected]
     classes: tuple[str, ...]
-    models: list[Model]
-    model: Model
+    models: list[ModelOnDisk]
+    model: ModelOnDisk
     """The chosen one."""
     key: str
 
 
-def make_class_job(labels: Labels, campaigns: list[Collected]) -> ClassJob:
+def make_class_job(labels: StoreLabels, campaigns: list[Collected]) -> ClassJob:
     """Find the inputs of the evaluation.
 
     Raises:

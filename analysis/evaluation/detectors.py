@@ -7,7 +7,7 @@ from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare, tuned
-from sliplab.analysis.detectors.detectors import Labelled, Predictions, Tuned
+from sliplab.analysis.detectors.detectors import Predictions, TrialWithSlip, Tuned
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.onset_references import References, references_of
 from sliplab.analysis.detectors.predictions import (
@@ -15,10 +15,10 @@ from sliplab.analysis.detectors.predictions import (
     prediction_request,
     predictions,
 )
-from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.protocols.settings import AnalysisSettings, Detection
-from sliplab.storage.schema.evaluation import Choice, DetectorComparison
+from sliplab.storage.schema.evaluation import DetectorComparison, RuleChoice
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -78,9 +78,11 @@ class DetectorWork:
             ),
         ]
 
-    def choices(self, store: Store, detection: dict[str, Detection]) -> dict[str, Choice | None]:
+    def choices(
+        self, store: Store, detection: dict[str, Detection]
+    ) -> dict[str, RuleChoice | None]:
         """Smoothing and margin by campaign; None where the protocol says them."""
-        found: dict[str, Choice | None] = {}
+        found: dict[str, RuleChoice | None] = {}
         for name, settings in detection.items():
             trials = self.choosing[name]
             if not trials:
@@ -127,7 +129,7 @@ class DetectorWork:
 
 
 def detector_work(
-    labels: Labels, campaigns: list[Collected], detection: dict[str, Detection], model_key: str
+    labels: StoreLabels, campaigns: list[Collected], detection: dict[str, Detection], model_key: str
 ) -> DetectorWork:
     """Find the trials and windows that detectors need.
 
@@ -200,12 +202,12 @@ def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts | N
     return Parts(**{name: [_labelled(store, t) for t in trials] for name, trials in known.items()})
 
 
-def _labelled(store: Store, trial: KnownTrial) -> Labelled:
+def _labelled(store: Store, trial: KnownTrial) -> TrialWithSlip:
     arrays = predictions(store, trial.request)
     windows = Predictions(arrays["counts"], arrays["events"], arrays["end_ns"])
-    return Labelled(windows, trial.slip, trial.references)
+    return TrialWithSlip(windows, trial.slip, trial.references)
 
 
-def _counted(store: Store, trial: KnownTrial) -> Counted:
+def _counted(store: Store, trial: KnownTrial) -> SpikeCounts:
     arrays = predictions(store, trial.request)
-    return Counted(arrays["counts"], arrays["end_ns"], trial.slip)
+    return SpikeCounts(arrays["counts"], arrays["end_ns"], trial.slip)

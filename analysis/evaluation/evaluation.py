@@ -18,9 +18,9 @@ from sliplab.analysis.evaluation.trials import score_row, summaries
 from sliplab.analysis.evaluation.windows import VERSION as WINDOWS_VERSION
 from sliplab.analysis.evaluation.windows import key_inputs, score_windows
 from sliplab.analysis.labels.label_errors import label_errors, rules_compared
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import (
-    Model,
+    ModelOnDisk,
     choose_model,
     rules_of,
     training_settings,
@@ -36,14 +36,14 @@ from sliplab.storage.trials.store import Store, StoreError
 
 
 @dataclass(frozen=True)
-class Job:
+class EvaluationJob:
     """Everything an evaluation depends on, found before anything is computed."""
 
     store: Store
     campaigns: list[Collected]
-    labels: Labels
-    model: Model
-    models: list[Model]
+    labels: StoreLabels
+    model: ModelOnDisk
+    models: list[ModelOnDisk]
     """Models of all seeds, the chosen one included."""
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
@@ -52,11 +52,11 @@ class Job:
     key: str
 
     @property
-    def others(self) -> list[Model]:
+    def others(self) -> list[ModelOnDisk]:
         """Models of the seeds that were not chosen."""
         return [model for model in self.models if model.seed != self.model.seed]
 
-    def counted_by(self, model: Model, item: Collected) -> list[tuple[str, Recording, str]]:
+    def counted_by(self, model: ModelOnDisk, item: Collected) -> list[tuple[str, Recording, str]]:
         """Return campaign, recording and key of spike counts of each trial that is scored."""
         stride = {"stride_ms": self.detection[item.name].stride_ms}
         return [
@@ -80,14 +80,14 @@ def make_job(
     margin: float | None = None,
     smoothing: int | None = None,
     reviewed: bool = False,
-) -> Job:
+) -> EvaluationJob:
     """Find the inputs of the evaluation, and its detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own, and of what these would choose.
         reviewed: people's decisions are applied to the labels.
     """
-    labels = Labels(store, reviewed)
+    labels = StoreLabels(store, reviewed)
     models = wanted_models(store, campaigns, reviewed)
     model = choose_model(models)
     settings = training_settings(campaigns)
@@ -119,7 +119,7 @@ def make_job(
     of_seeds = [BY_SEED_VERSION] if len(models) > 1 else []
     made_of = [model.key, inputs, detectors.inputs, REFERENCES_VERSION, *of_review, *of_seeds]
     key = make_key(STEP, VERSION, made_of, used)
-    return Job(store, campaigns, labels, model, models, detection, trials, detectors, key)
+    return EvaluationJob(store, campaigns, labels, model, models, detection, trials, detectors, key)
 
 
 def evaluation_of(store: Store) -> Evaluation:
@@ -139,7 +139,7 @@ def evaluation_of(store: Store) -> Evaluation:
 
 
 def _score_trials(
-    job: Job, detection: dict[str, Detection], other: Model | None = None
+    job: EvaluationJob, detection: dict[str, Detection], other: ModelOnDisk | None = None
 ) -> list[TrialScore]:
     """One row a trial: onsets, detections, latency.
 
@@ -159,7 +159,7 @@ def _score_trials(
     return rows
 
 
-def score_store(job: Job, train: SampleSet, test: SampleSet) -> None:
+def score_store(job: EvaluationJob, train: SampleSet, test: SampleSet) -> None:
     """Score windows, detections and labels, and keep them as one result."""
     settings = training_settings(job.campaigns)
     choices = job.detectors.choices(job.store, job.detection)

@@ -15,20 +15,20 @@ import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, kinematic_campaigns
 from sliplab.analysis.detectors.latency import true_slip
-from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing, settled
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing, settled
 from sliplab.analysis.evaluation.evaluation import BY_SEED_VERSION, FORMAT, NAME, STEP
 from sliplab.analysis.evaluation.trials import score_row, summaries
 from sliplab.analysis.evaluation.windows import NAME as WINDOWS_NAME
 from sliplab.analysis.evaluation.windows import STEP as WINDOWS
 from sliplab.analysis.evaluation.windows import compared, named, phases, seed_scores
 from sliplab.analysis.labels.label_errors import label_errors, rules_compared
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
 from sliplab.analysis.networks import marker_net
 from sliplab.analysis.networks.baselines import fit_rate_thresholds
 from sliplab.analysis.networks.marker_net import BATCH, EPOCHS, HIDDEN, POINTS, MarkerNet
-from sliplab.analysis.networks.models import Model, choose_model
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model
 from sliplab.analysis.windows import displacement
 from sliplab.analysis.windows.displacement import (
     FRAMES,
@@ -63,7 +63,7 @@ SMOOTHING, MARGIN = 3, 40.0
 """The rule where no trial can choose it."""
 
 
-def wanted_marker_models(labels: Labels, campaigns: list[Collected]) -> list[Model]:
+def wanted_marker_models(labels: StoreLabels, campaigns: list[Collected]) -> list[ModelOnDisk]:
     """The models that the settings ask for, one a seed, with the keys they must have.
 
     Raises:
@@ -90,7 +90,7 @@ def wanted_marker_models(labels: Labels, campaigns: list[Collected]) -> list[Mod
         [item.settings.samples.per_class for item in used],
     ]
     return [
-        Model(
+        ModelOnDisk(
             seed,
             labels.store.folder / "models" / f"markers-seed{seed}.model",
             make_key("train markers", marker_net.VERSION, inputs, [*fixed, seed]),
@@ -100,7 +100,9 @@ def wanted_marker_models(labels: Labels, campaigns: list[Collected]) -> list[Mod
     ]
 
 
-def train_marker_model(model: Model, train: MarkerSamples, validation: MarkerSamples) -> MarkerNet:
+def train_marker_model(
+    model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples
+) -> MarkerNet:
     """Train one seed and keep it; the document is written last and marks it as complete.
 
     Raises:
@@ -131,16 +133,16 @@ def train_marker_model(model: Model, train: MarkerSamples, validation: MarkerSam
 class MarkerJob:
     """Everything that an evaluation depends on, found before anything is computed."""
 
-    labels: Labels
+    labels: StoreLabels
     campaigns: list[Collected]
-    models: list[Model]
-    model: Model
+    models: list[ModelOnDisk]
+    model: ModelOnDisk
     detection: dict[str, Detection]
     key: str
 
 
 def make_marker_job(
-    labels: Labels,
+    labels: StoreLabels,
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
@@ -228,14 +230,14 @@ def evaluate_markers(job: MarkerJob) -> None:
     Derived.of(labels.store, STEP).write(NAME, job.key, result)
 
 
-def _frames(labels: Labels, item: Collected, recording: Recording) -> tuple[F32, I64]:
+def _frames(labels: StoreLabels, item: Collected, recording: Recording) -> tuple[F32, I64]:
     """Return every window of a trial, and the times of their newest frames."""
     frame_ns, moved = marker_displacements(labels, item, recording)
     x, newest = all_frames(moved)
     return x, frame_ns[newest]
 
 
-def _counted(job: MarkerJob, net: MarkerNet, split: str) -> list[Counted]:
+def _counted(job: MarkerJob, net: MarkerNet, split: str) -> list[SpikeCounts]:
     """Return the kinematic trials of a split that have both onsets."""
     found = []
     for item in kinematic_campaigns(job.campaigns):
@@ -243,7 +245,7 @@ def _counted(job: MarkerJob, net: MarkerNet, split: str) -> list[Counted]:
             slip = true_slip(job.labels.read(item, recording))
             if slip is not None:
                 x, end_ns = _frames(job.labels, item, recording)
-                found.append(Counted(net.points(x), end_ns, slip))
+                found.append(SpikeCounts(net.points(x), end_ns, slip))
     return found
 
 

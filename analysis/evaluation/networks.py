@@ -19,7 +19,7 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.trials import score_row, summaries
 from sliplab.analysis.evaluation.windows import intervals_of
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.metrics.classification import CLASSES
@@ -27,14 +27,14 @@ from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
 from sliplab.analysis.networks.models import comparison_models, rules_of, training_settings
 from sliplab.analysis.networks.network import spike_counts
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
-from sliplab.protocols.settings import Detection, Samples, Windows
+from sliplab.protocols.settings import Detection, SampleSettings, Windows
 from sliplab.storage.files import read_plain
 from sliplab.storage.schema.evaluation import OtherEvaluation, OtherWindowScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
@@ -86,7 +86,7 @@ class _Judging:
     network: OtherNetwork
     label: TrialLabel | None
     """Label of a trial that samples are taken from as well; None for others."""
-    samples: Samples
+    samples: SampleSettings
     seed: int
     stride_ms: int
     threads: int | None
@@ -164,7 +164,7 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
     )
 
 
-class About(TypedDict):
+class NetworkOrigin(TypedDict):
     """Origin of a network: preset and seed of a training; None where a file brought it."""
 
     preset: str | None
@@ -177,10 +177,10 @@ class Judgement:
 
     store: Store
     campaigns: list[Collected]
-    labels: Labels
+    labels: StoreLabels
     network: OtherNetwork
     rules: dict[str, Detection]
-    about: About
+    about: NetworkOrigin
 
     @property
     def data_key(self) -> str:
@@ -233,7 +233,7 @@ class Judgement:
 
 
 def file_judgement(
-    labels: Labels,
+    labels: StoreLabels,
     campaigns: list[Collected],
     network: OtherNetwork,
     margin: float | None = None,
@@ -250,11 +250,11 @@ def file_judgement(
         name: Detection.model_validate({**rule.model_dump(), **change, "compare": None})
         for name, rule in rules_of(campaigns, network.outputs_per_class).items()
     }
-    about = About(preset=None, seed=None)
+    about = NetworkOrigin(preset=None, seed=None)
     return Judgement(labels.store, campaigns, labels, network, rules, about)
 
 
-def comparison_judgements(labels: Labels, campaigns: list[Collected]) -> list[Judgement]:
+def comparison_judgements(labels: StoreLabels, campaigns: list[Collected]) -> list[Judgement]:
     """Return the networks that `analysis.also` names, each with its preset's rule.
 
     Raises:
@@ -281,12 +281,12 @@ def comparison_judgements(labels: Labels, campaigns: list[Collected]) -> list[Ju
             )
             for item in campaigns
         }
-        about = About(preset=settings.preset, seed=model.seed)
+        about = NetworkOrigin(preset=settings.preset, seed=model.seed)
         found.append(Judgement(labels.store, campaigns, labels, network, rules, about))
     return found
 
 
-def data_key(labels: Labels, campaigns: list[Collected]) -> str:
+def data_key(labels: StoreLabels, campaigns: list[Collected]) -> str:
     """The key of the test trials and their labels.
 
     Raises:
@@ -306,7 +306,7 @@ def kept(
 ) -> dict[str, OtherEvaluation]:
     """Results on the trials and labels of today, by name."""
     folder = Derived.of(store, STEP)
-    key = data_key(Labels(store, reviewed), campaigns)
+    key = data_key(StoreLabels(store, reviewed), campaigns)
     found = {}
     for path in sorted(folder.folder.glob("*.json")):
         if folder.read(path.stem).get("data_key") == key:
@@ -353,7 +353,7 @@ def _counter(
         return lambda x: spike_counts(net, x.dense())
     model = ExternalModel(description, content)
     if engine == "fast":
-        return Engine(model.fast(), model.windows.cells).counts
+        return SpikeEngine(model.fast(), model.windows.cells).counts
     sinabs = model.sinabs()
     return lambda x: sinabs.counts(x.dense())
 

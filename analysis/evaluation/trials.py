@@ -18,7 +18,7 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.detectors.predictions import window_counts
 from sliplab.analysis.detectors.smoothing_rule import detect
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
@@ -152,7 +152,7 @@ def quiet_alarms(trials: Iterable[tuple[TrialScore, Recording]]) -> AlarmRate | 
 
 def latencies(
     campaigns: list[Collected],
-    labels: Labels,
+    labels: StoreLabels,
     fitted: Fitted,
     whole: Quantised,
     on_trial: Callable[[], None] = lambda: None,
@@ -190,7 +190,7 @@ def _summary(rows: dict[str, list[TrialLatency]]) -> Latencies:
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedTrials:
     """Outputs of a network and a rule on a store's test trials.
 
     Attributes:
@@ -240,13 +240,13 @@ def judge(
     detection: Mapping[str, Detection],
     store: Store,
     campaigns: list[Collected],
-) -> Judged:
+) -> EvaluatedTrials:
     """Score the labelled test trials of a store by a network that another store trained.
 
     Args:
         detection: smoothing, margin and stride by campaign.
     """
-    labels, rows = Labels(store), []
+    labels, rows = StoreLabels(store), []
     for item in campaigns:
         settings = detection[item.name]
         for trial, recording in item.of_split("test"):
@@ -255,4 +255,4 @@ def judge(
             row = score_row(item, trial, of_trial, counts, end_ns, settings)
             rows.append((row, recording))
     samples = load_samples(labels, training_campaigns(campaigns), "test")
-    return Judged(training.predict_counts(fitted, samples.windows), samples, rows)
+    return EvaluatedTrials(training.predict_counts(fitted, samples.windows), samples, rows)

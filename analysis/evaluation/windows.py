@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
 from sliplab.analysis.networks.baselines import evaluate_baselines
-from sliplab.analysis.networks.models import Model, training_settings
+from sliplab.analysis.networks.models import ModelOnDisk, training_settings
 from sliplab.analysis.windows.dataset import SampleSet, recorded_span
 from sliplab.analysis.windows.sample_sets import (
     TrialRef,
@@ -34,7 +34,7 @@ from sliplab.storage.schema.evaluation import (
     SampleCounts,
     Seeds,
     SeedScores,
-    Spread,
+    SeedSpread,
     Tenth,
     WindowIntervals,
     WindowScores,
@@ -49,10 +49,10 @@ NAME = "test"
 
 
 def score_windows(
-    labels: Labels,
+    labels: StoreLabels,
     campaigns: list[Collected],
-    models: Sequence[Model],
-    chosen: Model,
+    models: Sequence[ModelOnDisk],
+    chosen: ModelOnDisk,
     key: str,
     train: SampleSet,
     test: SampleSet,
@@ -125,7 +125,7 @@ def named(of: TrialRef) -> tuple[str, str, dict[str, str]]:
 
 
 def phases(
-    labels: Labels,
+    labels: StoreLabels,
     known: Sequence[TrialRef],
     place_ns: npt.NDArray[np.int64],
     y: npt.NDArray[np.int64],
@@ -164,11 +164,11 @@ def phases(
 
 
 def seed_scores(
-    models: Sequence[Model],
-    chosen: Model,
+    models: Sequence[ModelOnDisk],
+    chosen: ModelOnDisk,
     y: npt.NDArray[np.int64],
     margin: float,
-    counts_of: Callable[[Model], npt.NDArray[np.int64]],
+    counts_of: Callable[[ModelOnDisk], npt.NDArray[np.int64]],
 ) -> Seeds:
     """Every trained seed on the same windows: each, and mean, lowest and highest."""
     rows = []
@@ -185,7 +185,7 @@ def seed_scores(
     spread = {}
     for kind in _KINDS:
         values = [value for row in rows if (value := getattr(row, kind)) is not None]
-        spread[kind] = Spread(
+        spread[kind] = SeedSpread(
             mean=float(np.mean(values)) if values else None,
             min=min(values, default=None),
             max=max(values, default=None),
@@ -196,7 +196,7 @@ def seed_scores(
 _KINDS = ("argmax", "strict", "margin")
 
 
-def key_inputs(models: Sequence[Model], campaigns: list[Collected]) -> list[Any]:
+def key_inputs(models: Sequence[ModelOnDisk], campaigns: list[Collected]) -> list[Any]:
     """Return the inputs of these figures besides the chosen model and the test trials."""
     return [VERSION, *several(campaigns), *(model.key for model in models)]
 

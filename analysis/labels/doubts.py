@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sliplab.analysis.labels.onsets import NO_ONSET, Onsets, paper_onsets
+from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, paper_onsets
 from sliplab.protocols.settings import Labelling
 
 Floats = NDArray[np.float64]
@@ -52,7 +52,7 @@ def doubts(
 def unseen(
     frame_ns: Ints,
     displacement: Floats,
-    onsets: Onsets,
+    onsets: LabelOnsets,
     centre: int,
     not_before_ns: int,
     motion_ns: int | None = None,
@@ -105,7 +105,7 @@ def uncertain(
     frame_ns: Ints,
     displacement: Floats,
     sigma: Floats,
-    onsets: Onsets,
+    onsets: LabelOnsets,
     centre: int,
     threshold_px: float,
     not_before_ns: int,

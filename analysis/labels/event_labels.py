@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sliplab.analysis.labels.doubts import Doubts, slipped_in_hold, unseen
-from sliplab.analysis.labels.event_slips import AT_REST_MM, Slips, slips
+from sliplab.analysis.labels.event_slips import AT_REST_MM, PapillaSlips, slips
 from sliplab.analysis.labels.event_tracking import (
     EventTracks,
     find_discs,
     track_discs,
     without_hot_pixels,
 )
-from sliplab.analysis.labels.onsets import NO_ONSET, Onsets, last_off_axis, paper_onsets
+from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, last_off_axis, paper_onsets
 from sliplab.analysis.labels.slip_times import SlipTimes
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.streams import EventChunk
@@ -78,7 +78,7 @@ class EventOnsets:
     displacement_px: F64
     sigma_px: F64
     hold_slip_px: F64
-    paper: Onsets
+    paper: LabelOnsets
     paper_doubts: Doubts
     intervals: tuple[Interval | None, Interval | None]
     slips: SlipTimes
@@ -189,7 +189,7 @@ def _directions(base: F64, way: F64) -> F64:
 
 
 def _onsets(
-    found: Slips,
+    found: PapillaSlips,
     tracks: EventTracks,
     t_ns: I64,
     way: F64,
@@ -223,7 +223,7 @@ def _onsets(
         t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns
     )
 
-    def doubts(onsets: Onsets) -> Doubts:
+    def doubts(onsets: LabelOnsets) -> Doubts:
         return held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns)).or_else(
             _near_lost(onsets, lost_ns)
         )
@@ -257,7 +257,7 @@ def crossing_intervals(
     t_ns: I64,
     moved_px: F64,
     sigma_px: F64,
-    paper: Onsets,
+    paper: LabelOnsets,
     centre: int,
     threshold_px: float,
     start_ns: int,
@@ -296,7 +296,7 @@ def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
     return Doubts(*reasons)
 
 
-def _near_lost(onsets: Onsets, lost_ns: I64) -> Doubts:
+def _near_lost(onsets: LabelOnsets, lost_ns: I64) -> Doubts:
     """Return doubts about onsets near lost events."""
 
     def of(onset: int | None) -> str | None:
@@ -316,7 +316,7 @@ def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
         unknown,
         unknown,
         np.full(markers, np.nan),
-        Onsets(None, None, None, none),
+        LabelOnsets(None, None, None, none),
         doubts,
         (None, None),
         SlipTimes(none, none, none, centre),

@@ -45,7 +45,7 @@ _WIDER = 1.4
 
 
 @dataclass(frozen=True)
-class Slips:
+class PapillaSlips:
     """Slips of m papillae over n slices.
 
     Attributes:
@@ -64,7 +64,9 @@ class Slips:
     gain: F64
 
 
-def slips(way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: float) -> Slips:
+def slips(
+    way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: float
+) -> PapillaSlips:
     """Find each papilla's slip.
 
     Args:
@@ -109,7 +111,7 @@ def slips(way_mm: F64, moved_px: F64, sigma_px: F64, first: int, backlash_px: fl
         held = np.flatnonzero(np.isfinite(moved_px[:first, marker]))
         distance[held, marker] = moved_px[held, marker] / gain
         sigma[held, marker] = np.hypot(rest, sigma_px[held, marker] / gain)
-    return Slips(knees[1], knees[0], knees[2], distance, sigma, gains)
+    return PapillaSlips(knees[1], knees[0], knees[2], distance, sigma, gains)
 
 
 def _smooth(s: F64, y: F64) -> F64:

@@ -8,15 +8,15 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.storage.schema.evaluation import (
-    Coverage,
-    Deviation,
+    ChangePointCoverage,
     DeviationByOnset,
     LabelCheck,
     LabelErrors,
     RuleErrors,
+    SignedDeviation,
 )
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
-from sliplab.storage.schema.summary import Hold
+from sliplab.storage.schema.summary import HoldSummary
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -78,7 +78,7 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
     coverage = float(np.mean(inside)) if inside else None
     return RuleErrors(
         **{name: by_onset(kinds) for name, kinds in found.items()},
-        papillae=Coverage(**dict(spread(errors)), coverage=coverage),
+        papillae=ChangePointCoverage(**dict(spread(errors)), coverage=coverage),
     )
 
 
@@ -110,7 +110,7 @@ def force_compared(
     return apart
 
 
-def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Hold]:
+def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, HoldSummary]:
     """Slips in the hold by campaign, and how far apart onsets from its two ends are.
 
     For each campaign `trials`; `slipped`, how many moved by more than `limit_px` (the protocol's
@@ -135,7 +135,7 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Hold]:
                 start, end = ((label.references or {})[at].at_ns(kind) for at in REFERENCES)
                 if start is not None and end is not None:
                     apart[kind].append((end - start) / 1e6)
-        found[item.name] = Hold(
+        found[item.name] = HoldSummary(
             trials=len(known),
             slipped=sum(limit is not None and px > limit for px in most),
             limit_px=limit,
@@ -164,10 +164,10 @@ def by_onset(values: Mapping[str, list[float]]) -> DeviationByOnset:
     return DeviationByOnset(incipient=spread(values["incipient"]), gross=spread(values["gross"]))
 
 
-def spread(values: list[float]) -> Deviation:
+def spread(values: list[float]) -> SignedDeviation:
     """Summarise differences."""
     there = np.asarray(values)
-    return Deviation(
+    return SignedDeviation(
         n=len(values),
         median=float(np.median(there)) if len(there) else None,
         median_abs=float(np.median(np.abs(there))) if len(there) else None,

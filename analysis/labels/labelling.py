@@ -20,7 +20,7 @@ from sliplab.analysis.labels.force_onsets import ForceOnsets, onsets_by_force
 from sliplab.analysis.labels.given_labels import given_label
 from sliplab.analysis.labels.onsets import (
     NO_ONSET,
-    Onsets,
+    LabelOnsets,
     last_off_axis,
     paper_onsets,
     rest_time,
@@ -52,7 +52,7 @@ HOLD_SLIP_PX = 1.0
 
 
 @dataclass(frozen=True)
-class Counted:
+class HoldEndOnsets:
     """Onsets by the paper's rule, with displacements counted from one end of the hold.
 
     Attributes:
@@ -61,7 +61,7 @@ class Counted:
         displacement_px: (n, m) float64, NaN where a marker was lost.
     """
 
-    onsets: Onsets
+    onsets: LabelOnsets
     doubts: Doubts
     displacement_px: F64
 
@@ -87,7 +87,7 @@ class Label:
 
     rule: Rule
     reference: Reference
-    references: dict[Reference, Counted]
+    references: dict[Reference, HoldEndOnsets]
     slips: SlipTimes
     slip_doubts: Doubts
     frame_ns: npt.NDArray[np.int64]
@@ -102,7 +102,7 @@ class Label:
     intervals: OnsetIntervals | None = None
 
     @property
-    def paper(self) -> Onsets:
+    def paper(self) -> LabelOnsets:
         """Onsets by the paper's rule, counted from the reference."""
         return self.references[self.reference].onsets
 
@@ -117,12 +117,12 @@ class Label:
         return self.references[self.reference].displacement_px
 
     @property
-    def onsets(self) -> Onsets:
+    def onsets(self) -> LabelOnsets:
         """Onsets by the protocol's rule."""
         if self.rule == "force":
             found, none = self.force, np.full_like(self.paper.per_marker_ns, NO_ONSET)
             known = (None, None) if found is None else (found.incipient_ns, found.gross_ns)
-            return Onsets(*known, None, none)
+            return LabelOnsets(*known, None, none)
         return self.paper if self.rule == "paper" else self.slips.onsets
 
     @property
@@ -273,7 +273,7 @@ def _label_events(recording: Recording, settings: Labelling) -> Label:
     """Label a trial by its events; see `event_labels`."""
     found = onsets_by_events(recording, settings)
     start_ns, stop_ns = recording.motion_ns
-    counted = Counted(found.paper, found.paper_doubts, found.displacement_px)
+    counted = HoldEndOnsets(found.paper, found.paper_doubts, found.displacement_px)
     return Label(
         settings.rule,
         settings.reference,
@@ -341,7 +341,7 @@ def label_places(
     held = slipped_in_hold(found.hold_slip_px, settings.hold_slip_px)
     knocked = _knocked(frame_ns, found.camera)
 
-    def counted(reference: Reference, from_ns: int) -> Counted:
+    def counted(reference: Reference, from_ns: int) -> HoldEndOnsets:
         away = found.counted_from(reference)
         moved = np.hypot(away[..., 0], away[..., 1])
         paper = paper_onsets(frame_ns, moved, centre, settings, from_ns)
@@ -349,9 +349,11 @@ def label_places(
         vague = uncertain(
             frame_ns, moved, found.sigma, paper, centre, settings.threshold_px, from_ns
         )
-        return Counted(paper, held.or_else(lost).or_else(vague).or_else(knocked(paper)), moved)
+        return HoldEndOnsets(
+            paper, held.or_else(lost).or_else(vague).or_else(knocked(paper)), moved
+        )
 
-    references: dict[Reference, Counted] = {
+    references: dict[Reference, HoldEndOnsets] = {
         "hold_start": counted("hold_start", int(frame_ns[0])),
         "hold_end": counted("hold_end", start_ns),
     }
@@ -396,7 +398,7 @@ def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:
     """Return doubts about onsets after the camera moved while too few markers were at rest."""
     moved = frame_ns[camera.unsure]
 
-    def doubts(onsets: Onsets) -> Doubts:
+    def doubts(onsets: LabelOnsets) -> Doubts:
         reason = "the camera moved while too few markers stood still to tell how far"
 
         def of(onset: int | None) -> str | None:
@@ -417,7 +419,7 @@ def _doubts(doubts: Doubts) -> OnsetDoubts:
     return OnsetDoubts(incipient=doubts.incipient, gross=doubts.gross or doubts.incipient)
 
 
-def _onsets(onsets: Onsets, doubts: Doubts) -> dict[str, Any]:
+def _onsets(onsets: LabelOnsets, doubts: Doubts) -> dict[str, Any]:
     return {
         "incipient_ns": onsets.incipient_ns,
         "gross_ns": onsets.gross_ns,

@@ -48,7 +48,7 @@ _PATIENT_EVERY = 4
 """A marker lost for more than 20 frames is searched in every fourth."""
 
 
-class Measured(NamedTuple):
+class FrameMarkers(NamedTuple):
     """The markers in one frame.
 
     Attributes:
@@ -66,7 +66,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MarkerTracks:
-    """One track a marker: the columns of `Measured` over n frames."""
+    """One track a marker: the columns of `FrameMarkers` over n frames."""
 
     xy: Floats
     """(n, m, 2)."""
@@ -124,7 +124,7 @@ class MarkerTracker:
         """The markers' median radius; 0 before they were found."""
         return self._radius
 
-    def update(self, frame: Frame) -> Measured:
+    def update(self, frame: Frame) -> FrameMarkers:
         """The markers in the next frame.
 
         Raises:
@@ -137,9 +137,11 @@ class MarkerTracker:
             self._follow(frame)
         if self._whole == len(self._xy):
             found = self._measured.copy()
-            return Measured(self._xy.copy(), self._everywhere, found[:, SIGMA], found[:, QUALITY])
+            return FrameMarkers(
+                self._xy.copy(), self._everywhere, found[:, SIGMA], found[:, QUALITY]
+            )
         ok = self._state == WHOLE
-        return Measured(
+        return FrameMarkers(
             np.where(ok[:, None], self._xy, np.nan),
             ok,
             np.where(ok, self._measured[:, SIGMA], np.nan),
@@ -292,7 +294,7 @@ def track(
     return stack_tracks([tracker.update(frame) for frame in frames], len(layout_px))
 
 
-def stack_tracks(rows: list[Measured], markers: int) -> MarkerTracks:
+def stack_tracks(rows: list[FrameMarkers], markers: int) -> MarkerTracks:
     """The results of `MarkerTracker.update` as one `MarkerTracks`."""
     if not rows:
         nothing = np.empty((0, markers))

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from sliplab.protocols.settings import Labelling
 
 NO_ONSET = -1
-"""Value in `Onsets.per_marker_ns` of a marker that never slipped."""
+"""Value in `LabelOnsets.per_marker_ns` of a marker that never slipped."""
 
 
 @dataclass(frozen=True)
-class Onsets:
+class LabelOnsets:
     """The onsets of one trial, on its time line.
 
     Attributes:
@@ -37,7 +37,7 @@ class Onsets:
     per_marker_ns: NDArray[np.int64]
 
 
-def last_off_axis(onsets: Onsets, centre: int) -> int:
+def last_off_axis(onsets: LabelOnsets, centre: int) -> int:
     """The marker besides the centre that slips last, or one that never does: gross in a twist.
 
     About its own axis the centre marker turns on the spot, however far the others have slipped.
@@ -122,7 +122,7 @@ def paper_onsets(
     centre: int,
     settings: Labelling,
     not_before_ns: int | None = None,
-) -> Onsets:
+) -> LabelOnsets:
     """The paper's rule: the time of the first frame over the threshold, marker by marker.
 
     Args:
@@ -153,11 +153,11 @@ def paper_onsets(
         over &= (frame_ns >= not_before_ns)[:, None]
     slipped = np.asarray(over.any(axis=0))
     if not slipped.any():
-        return Onsets(None, None, None, np.full(markers, NO_ONSET, np.int64))
+        return LabelOnsets(None, None, None, np.full(markers, NO_ONSET, np.int64))
     frame = over.argmax(axis=0)
     first = int(frame[slipped].min())
     in_first = np.where(over[first], displacement[first], -1.0)
-    return Onsets(
+    return LabelOnsets(
         incipient_ns=int(frame_ns[first]),
         gross_ns=int(frame_ns[frame[centre]]) if slipped[centre] else None,
         first_marker=int(in_first.argmax()),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.labels.markers import MarkerTracks
-from sliplab.analysis.labels.plane import Plane, plane_of
+from sliplab.analysis.labels.plane import Perspective, plane_of
 from sliplab.analysis.labels.plate_tracking import PlateTrack, track_video
 from sliplab.storage.trials.recording import Recording
 
@@ -35,7 +35,7 @@ class Places:
     sigma: F64
     quality: F64
     plate: PlateTrack | None = None
-    plane: Plane | None = None
+    plane: Perspective | None = None
 
     @property
     def flat_xy(self) -> F64:

@@ -27,7 +27,7 @@ _SURE = 25.0
 
 
 @dataclass(frozen=True)
-class Plane:
+class Perspective:
     """Perspective of a picture: x' = (x + A x) / (1 + g x) about the picture's centre.
 
     Attributes:
@@ -51,7 +51,9 @@ class Plane:
         return result
 
 
-def plane_of(corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int]) -> Plane | None:
+def plane_of(
+    corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int]
+) -> Perspective | None:
     """The plane in which a square's corners make the same square in every frame.
 
     Args:
@@ -74,14 +76,14 @@ def plane_of(corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int])
     squares = corners[here[chosen]]
 
     def misfit(values: Floats) -> Floats:
-        plane = Plane(centre, values[:2] * _STRETCH, values[2:] * _TILT)
+        plane = Perspective(centre, values[:2] * _STRETCH, values[2:] * _TILT)
         return np.concatenate((_unlike(plane.flat(squares)).ravel() / CORNER_PX, values))
 
     straight = misfit(np.zeros(4))
     fit = least_squares(misfit, np.zeros(4))
     if float(straight @ straight) - 2 * float(fit.cost) < _SURE:
         return None
-    return Plane(centre, fit.x[:2] * _STRETCH, fit.x[2:] * _TILT)
+    return Perspective(centre, fit.x[:2] * _STRETCH, fit.x[2:] * _TILT)
 
 
 def _unlike(quads: Floats) -> Floats:

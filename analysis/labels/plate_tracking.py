@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.blobs import Floats, Frame, checked_frame
-from sliplab.analysis.labels.markers import MarkerTracker, MarkerTracks, Measured, stack_tracks
+from sliplab.analysis.labels.markers import FrameMarkers, MarkerTracker, MarkerTracks, stack_tracks
 from sliplab.analysis.labels.plate_kernels import cells, refine_square
 
 MAX_BRIDGED = 5
@@ -217,7 +217,7 @@ def track_video(
     """
     markers = MarkerTracker(layout_px, threshold=threshold)
     plate = PlateTracker(marker_id) if with_plate else None
-    rows: list[Measured] = []
+    rows: list[FrameMarkers] = []
     poses: list[PlatePose] = []
     for frame in frames:
         rows.append(markers.update(frame))

@@ -47,7 +47,7 @@ def state_of(decision: Decision | None, key: str) -> State:
 
 
 @dataclass(frozen=True)
-class Labels:
+class StoreLabels:
     """The labels of a store.
 
     Attributes:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sliplab.analysis.labels.change_point import change_point, departure
 from sliplab.analysis.labels.doubts import Doubts
-from sliplab.analysis.labels.onsets import NO_ONSET, Onsets
+from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,14 +35,14 @@ class SlipTimes:
     widest_ns: int = WIDEST_NS
 
     @property
-    def onsets(self) -> Onsets:
+    def onsets(self) -> LabelOnsets:
         """Onsets of the first papilla and of the centre."""
         slipped = self.at_ns != NO_ONSET
         if not slipped.any():
-            return Onsets(None, None, None, self.at_ns)
+            return LabelOnsets(None, None, None, self.at_ns)
         first = int(np.where(slipped, self.at_ns, np.iinfo(np.int64).max).argmin())
         gross = int(self.at_ns[self.centre])
-        return Onsets(
+        return LabelOnsets(
             int(self.at_ns[first]), None if gross == NO_ONSET else gross, first, self.at_ns
         )
 

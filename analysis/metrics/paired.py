@@ -15,7 +15,7 @@ from scipy.stats import t as student
 
 
 @dataclass(frozen=True)
-class Difference:
+class PairedDifference:
     """A mean difference over seeds.
 
     Attributes:
@@ -39,7 +39,7 @@ class Difference:
 
 def paired_difference(
     ours: Sequence[float | None], theirs: Sequence[float | None], level: float = 0.95
-) -> Difference:
+) -> PairedDifference:
     """Ours less theirs, seed by seed.
 
     Args:
@@ -52,9 +52,9 @@ def paired_difference(
     both = [a - b for a, b in zip(ours, theirs, strict=True) if a is not None and b is not None]
     n = len(both)
     if not n:
-        return Difference(None, None, None, 0)
+        return PairedDifference(None, None, None, 0)
     mean = float(np.mean(both))
     if n == 1:
-        return Difference(mean, None, None, 1)
+        return PairedDifference(mean, None, None, 1)
     half = float(student.ppf(0.5 + level / 2, n - 1)) * float(np.std(both, ddof=1)) / n**0.5
-    return Difference(mean, mean - half, mean + half, n)
+    return PairedDifference(mean, mean - half, mean + half, n)

@@ -17,7 +17,7 @@ from scipy.special import log_softmax
 
 from sliplab.analysis.metrics.classification import Counts, IntArray, Labels, check
 from sliplab.analysis.metrics.window_groups import share
-from sliplab.storage.schema.evaluation import Calibration, CalibrationScores, LeadShare
+from sliplab.storage.schema.evaluation import CalibrationScores, LeadShare, ProbabilityCalibration
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def expected_calibration_error(
 
 def calibration(
     counts: Counts, labels: Labels, held_counts: Counts, held_labels: Labels
-) -> Calibration:
+) -> ProbabilityCalibration:
     """The temperature that validation windows give, and its scores on test windows.
 
     Args:
@@ -118,7 +118,9 @@ def calibration(
     counts, labels = check(counts, labels)
     temperature = fit_temperature(held_counts, held_labels)
     if temperature is None or not len(labels):
-        return Calibration(temperature=temperature, ece=None, cross_entropy=None, uncalibrated=None)
+        return ProbabilityCalibration(
+            temperature=temperature, ece=None, cross_entropy=None, uncalibrated=None
+        )
 
     def scores(t: float) -> CalibrationScores:
         p = np.exp(log_softmax(counts / t, axis=1))
@@ -127,6 +129,6 @@ def calibration(
             cross_entropy=cross_entropy(counts, labels, t),
         )
 
-    return Calibration(
+    return ProbabilityCalibration(
         temperature=temperature, **dict(scores(temperature)), uncalibrated=scores(1.0)
     )

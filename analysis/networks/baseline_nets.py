@@ -95,7 +95,7 @@ class _Recurrent(nn.Module):
         return self.last(states[:, -1])
 
 
-class _Steps(nn.Module):
+class _StepConvolutions(nn.Module):
     """Three convolutions over the steps, each of stride 2, that mix all cells of a step."""
 
     def __init__(self, shape: Shape, classes: int) -> None:
@@ -123,12 +123,15 @@ KINDS: dict[str, Callable[[Shape, int], nn.Module]] = {
 }
 """Name to network, of windows with rows and columns of cells."""
 
-TAXEL_KINDS: dict[str, Callable[[Shape, int], nn.Module]] = {"cnn_steps": _Steps, "gru": _Recurrent}
+TAXEL_KINDS: dict[str, Callable[[Shape, int], nn.Module]] = {
+    "cnn_steps": _StepConvolutions,
+    "gru": _Recurrent,
+}
 """Name to network, of windows with a single cell."""
 
 
 @dataclass(frozen=True)
-class _Best:
+class _BestEpoch:
     strict: float
     loss: float
     epoch: int
@@ -173,7 +176,7 @@ def fitted_net(
         torch.manual_seed(seed)
         net = (KINDS | TAXEL_KINDS)[kind](train.windows.shape, classes)
     optimizer = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
-    best: _Best | None = None
+    best: _BestEpoch | None = None
     steps = epochs * math.ceil(len(train) / batch)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for done in range(1, epochs + 1):
@@ -186,7 +189,7 @@ def fitted_net(
         )
         if best is None or (strict, -loss) > (best.strict, -best.loss):
             state = {name: value.clone() for name, value in net.state_dict().items()}
-            best = _Best(strict, loss, done, state)
+            best = _BestEpoch(strict, loss, done, state)
         if on_epoch is not None:
             on_epoch(done, strict)
     assert best is not None

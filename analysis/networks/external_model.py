@@ -33,7 +33,7 @@ from sliplab.analysis.networks.network import (
     set_weights,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, input_error, load, register_tags
 from sliplab.storage.files import read_plain
 
@@ -495,7 +495,7 @@ def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.S
         if conv.stride != (stride, stride):
             raise ValueError("strides must be 1 and 2")
     net = build(
-        Network(
+        NetworkSettings(
             conv1_channels=conv1.out_channels,
             conv2_channels=conv2.out_channels,
             conv1_kernel=conv1.kernel_size[0],

@@ -38,12 +38,12 @@ from sliplab.analysis.networks.network import (
     reset_states,
     set_matrices,
 )
-from sliplab.analysis.networks.spiking import Job, Trainer, WindowLoss, neuron
+from sliplab.analysis.networks.spiking import GradientJob, Trainer, WindowLoss, neuron
 from sliplab.analysis.windows.sparse import SparseWindows
 
 
 @dataclass(frozen=True)
-class Batch:
+class GradientBatch:
     """Loss, spikes and gradients of a batch.
 
     Attributes:
@@ -66,7 +66,7 @@ class Work(Protocol):
     def take(self, weights: list[npt.NDArray[np.float32]]) -> None:
         """Use these (`analysis.networks.network.matrices`) from now on."""
 
-    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
+    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> GradientBatch:
         """Loss and gradients of the windows `rows` with their labels ``y[rows]``."""
 
 
@@ -101,12 +101,12 @@ class EventDriven:
         """Use these from now on."""
         self._trainer.take(weights)
 
-    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
+    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> GradientBatch:
         """Compute parts in any order and sum them in theirs: the same bits with any threads."""
         leaves = self._trainer.leaves
 
-        def compute(some: IntArray) -> tuple[float, Job, tuple[torch.Tensor, ...]]:
-            job = Job(self._trainer, x, some, y[some], self._gain)
+        def compute(some: IntArray) -> tuple[float, GradientJob, tuple[torch.Tensor, ...]]:
+            job = GradientJob(self._trainer, x, some, y[some], self._gain)
             loss = WindowLoss.apply(job, *leaves)  # type: ignore[no-untyped-call]
             return loss.item(), job, torch.autograd.grad(loss, leaves)
 
@@ -120,7 +120,7 @@ class EventDriven:
             torch.stack(each).sum(dim=0).numpy()
             for each in zip(*(grads for _, _, grads in done), strict=True)
         ]
-        return Batch(
+        return GradientBatch(
             sum(loss for loss, _, _ in done),
             np.concatenate([job.counts for _, job, _ in done]),
             fired,
@@ -306,7 +306,7 @@ class OnDevice:
         """Use these from now on."""
         set_matrices(self._net, weights)
 
-    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
+    def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> GradientBatch:
         """Compute the whole batch at once; the pool is not used."""
         dense = torch.from_numpy(x.take(rows).dense()).to(self._device, torch.float32)
         reset_states(self._net)
@@ -320,7 +320,7 @@ class OnDevice:
             trained = parameters(self._net)
             grads = torch.autograd.grad(loss, list(trained.values()))
         reset_states(self._net)
-        return Batch(
+        return GradientBatch(
             loss.item(),
             counts.detach().cpu().numpy().astype(np.int64),
             {name: float(rate) * len(rows) for name, rate in self._fired.items()},

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import EpochRecord, Fitted, check_classes, restore
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.storage.files import MOST_BYTES, read_plain, write_bytes
 
 FORMAT = "sliplab-model-1"
@@ -83,7 +83,7 @@ def parse(data: bytes, name: str) -> Fitted:
             raise ValueError(f"its format is not {FORMAT}")
         fitted = Fitted(
             state_dict=content["state_dict"],
-            network=Network.model_validate(content["network"]),
+            network=NetworkSettings.model_validate(content["network"]),
             windows=Windows.model_validate(content["windows"]),
             training=Training.model_validate(content["training"]),
             seed=content["seed"],

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
@@ -17,7 +17,7 @@ from sliplab.storage.trials.store import Store, StoreError
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelOnDisk:
     """A trained network on disk."""
 
     seed: int
@@ -78,7 +78,9 @@ def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, 
     return {item.name: item.settings.rule_for(outputs_per_class, margin) for item in campaigns}
 
 
-def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
+def wanted_models(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> list[ModelOnDisk]:
     """The models that the settings ask for, with the keys they must have.
 
     Args:
@@ -93,7 +95,7 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
 
 def comparison_models(
     store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> list[Model]:
+) -> list[ModelOnDisk]:
     """Models of the comparison network that `analysis.also` names; none without one."""
     settings = training_settings(campaigns).comparison_settings()
     if settings is None:
@@ -103,7 +105,7 @@ def comparison_models(
 
 def wanted_class_models(
     store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> list[Model]:
+) -> list[ModelOnDisk]:
     """The models of recordings that show classes; see `wanted_models`.
 
     Raises:
@@ -123,9 +125,9 @@ def _models(
     reviewed: bool,
     prefix: str,
     classes: tuple[str, ...] = (),
-) -> list[Model]:
+) -> list[ModelOnDisk]:
     inputs = []
-    labels = Labels(store, reviewed)
+    labels = StoreLabels(store, reviewed)
     for item in used:
         for trial, recording in item.trials:
             if not labels.fresh(item, recording):
@@ -151,11 +153,11 @@ def _models(
             {**parameters, "seed": seed, "dataset": dataset.VERSION},
         )
         path = store.folder / "models" / f"{prefix}seed{seed}.pt"
-        models.append(Model(seed, path, key, settings, classes))
+        models.append(ModelOnDisk(seed, path, key, settings, classes))
     return models
 
 
-def begun(model: Model) -> bytes | None:
+def begun(model: ModelOnDisk) -> bytes | None:
     """Return the state at which a training of this model stopped; None where none began."""
     try:
         return model.state_path.read_bytes()
@@ -163,7 +165,7 @@ def begun(model: Model) -> bytes | None:
         return None
 
 
-def choose_model(models: list[Model]) -> Model:
+def choose_model(models: list[ModelOnDisk]) -> ModelOnDisk:
     """The model with the best strict validation accuracy; ties go to the first seed.
 
     Raises:

@@ -20,7 +20,7 @@ from sinabs.layers import IAFSqueeze
 from torch import nn
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 """Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""
@@ -45,7 +45,7 @@ Counts = npt.NDArray[np.int64]
 
 
 def build(
-    settings: Network, windows: Windows, seed: int, classes: int = len(CLASSES)
+    settings: NetworkSettings, windows: Windows, seed: int, classes: int = len(CLASSES)
 ) -> nn.Sequential:
     """A network with fresh weights: conv, conv of stride 2, two fully connected, IAF after each.
 

@@ -20,7 +20,7 @@ from torch import nn
 
 from sliplab.analysis.networks import spiking_gradients, spiking_kernels
 from sliplab.analysis.networks.network import SPIKING, classes_of, matrices
-from sliplab.analysis.networks.spiking_layout import Layout
+from sliplab.analysis.networks.spiking_layout import NetworkLayout
 from sliplab.analysis.windows.sparse import SparseWindows
 
 F32 = npt.NDArray[np.float32]
@@ -31,7 +31,7 @@ CHUNK = 64
 """Windows that a thread counts at a time."""
 
 
-class Engine:
+class SpikeEngine:
     """Spike counts of one network, with the weights that it has now.
 
     Args:
@@ -47,7 +47,7 @@ class Engine:
         self.threshold, _, _ = neuron(net)
         self.classes = classes_of(net)
         weights = matrices(net)
-        self._layout = Layout(tuple(w.shape for w in weights), cells)
+        self._layout = NetworkLayout(tuple(w.shape for w in weights), cells)
         self._layers = self._layout.layers(weights)
         self.shape = (self.steps, weights[0].shape[1], cells, cells)
         self._idle: list[tuple[Any, Any]] = []
@@ -95,9 +95,9 @@ class Engine:
         side_by_side(some, range(0, len(x), CHUNK), threads)
         return out, fired
 
-    def stream(self) -> Stream:
+    def stream(self) -> StatefulNetwork:
         """Return the network as a stepper that starts at rest."""
-        return Stream(self)
+        return StatefulNetwork(self)
 
     def sparse(self, x: Samples) -> SparseWindows:
         """The samples as the kernels read them.
@@ -122,10 +122,10 @@ class Engine:
             return self._layout.state(), self._layout.scratch()
 
 
-class Stream:
+class StatefulNetwork:
     """A network that is given one step after the other, and keeps its potentials."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: SpikeEngine) -> None:
         self._engine = engine
         self._state = engine._layout.state()
         self._scratch = engine._layout.scratch()
@@ -169,7 +169,7 @@ class WindowLoss(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, job: Job, *weights: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, job: GradientJob, *weights: torch.Tensor) -> torch.Tensor:
         """Float64 (); `weights` are the trainer's `leaves`."""
         ctx.job = job
         return torch.tensor(job.run(), dtype=torch.float64)
@@ -182,7 +182,7 @@ class WindowLoss(torch.autograd.Function):
         return None, *(grads if factor == 1.0 else (grad * factor for grad in grads))
 
 
-class Job:
+class GradientJob:
     """A few windows through a network and back.
 
     Args:
@@ -248,13 +248,13 @@ class Job:
 
 
 class Trainer:
-    """A network's packed weights and memory, for `Job`s in several threads."""
+    """A network's packed weights and memory, for `GradientJob`s in several threads."""
 
     def __init__(self, net: nn.Sequential, cells: int) -> None:
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.constants = neuron(net)
         self.classes = classes_of(net)
-        self.layout = Layout(tuple(w.shape for w in matrices(net)), cells)
+        self.layout = NetworkLayout(tuple(w.shape for w in matrices(net)), cells)
         self._idle: list[Any] = []
         self.take(matrices(net))
 

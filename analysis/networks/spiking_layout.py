@@ -29,7 +29,7 @@ def whole(count: int, of: int) -> int:
 
 
 @dataclass(frozen=True)
-class Plane:
+class LayerPlane:
     """Neurons of a layer: a square of channels-last pixels in a border, or a row of neurons.
 
     Attributes:
@@ -85,7 +85,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Table:
+class ConnectionTable:
     """Connections of a layer: what each source reaches, and where its weights are packed.
 
     Attributes:
@@ -105,7 +105,7 @@ class Table:
     runs: int
     length: int
     order: I64
-    target: Plane
+    target: LayerPlane
     bias: int = -1
 
     @property
@@ -131,7 +131,7 @@ class Table:
         return places
 
 
-def first_convolution(channels: int, cells: int, kernel: int, plane: Plane) -> Table:
+def first_convolution(channels: int, cells: int, kernel: int, plane: LayerPlane) -> ConnectionTable:
     """Connect the input's cells (channel, y, x); torch's weight is (c1, channels, kernel, kernel).
 
     A unit at (y, x) reaches outputs y + kernel // 2 - d by tap d, for each d: in the order of
@@ -149,7 +149,9 @@ def first_convolution(channels: int, cells: int, kernel: int, plane: Plane) -> T
     reach[..., 0] = (line[:, None] * plane.full + line) * plane.depth
     reach[..., 1] = i[:, :, :, 0] * kernel * length
     stride = plane.full * plane.depth
-    return Table(reach.reshape(-1, 2), length, stride, kernel, length, order.ravel(), plane)
+    return ConnectionTable(
+        reach.reshape(-1, 2), length, stride, kernel, length, order.ravel(), plane
+    )
 
 
 def strided_taps(kernel: int) -> tuple[list[list[int]], list[int]]:
@@ -163,17 +165,17 @@ def strided_taps(kernel: int) -> tuple[list[list[int]], list[int]]:
     return taps, [(parity + p - of[0]) // 2 if of else 0 for parity, of in enumerate(taps)]
 
 
-def strided_plane(cells: int, c2: int, kernel: int) -> Plane:
+def strided_plane(cells: int, c2: int, kernel: int) -> LayerPlane:
     """The neurons of the second convolution, with room for every tap."""
     taps, first = strided_taps(kernel)
     side = (cells + 1) // 2
     pad = max(0, *(-at for at in first))
     most = max(map(len, taps))  # those that there are not are filled up with zeros
     ends = [y // 2 + first[y % 2] + most for y in range(cells)]
-    return Plane(side, c2, pad, pad + max(side, *ends))
+    return LayerPlane(side, c2, pad, pad + max(side, *ends))
 
 
-def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
+def second_convolution(below: LayerPlane, kernel: int, plane: LayerPlane) -> ConnectionTable:
     """Connect layer 1, stride 2; torch's weight is (c2, c1, kernel, kernel)."""
     taps, first = strided_taps(kernel)
     c1, c2 = below.channels, plane.channels
@@ -194,12 +196,14 @@ def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
     length = most * plane.depth
     block = most * length
     reach[index, 1] = ((np.arange(c1) * 2 + parity[:, None, None]) * 2 + parity[:, None]) * block
-    return Table(reach, length, plane.full * plane.depth, most, length, order.ravel(), plane)
+    return ConnectionTable(
+        reach, length, plane.full * plane.depth, most, length, order.ravel(), plane
+    )
 
 
-def full_layer(below: Plane, n: int) -> Table:
+def full_layer(below: LayerPlane, n: int) -> ConnectionTable:
     """Connect a whole layer; the matrix is (n, channels * side * side + 1), channels first."""
-    plane = Plane(1, n, 0, 1)
+    plane = LayerPlane(1, n, 0, 1)
     index = below.index()
     sources = index.transpose(2, 0, 1).ravel()  # in the order in which torch flattens
     order = np.full((below.size + 1, plane.depth), -1, np.int64)
@@ -209,10 +213,12 @@ def full_layer(below: Plane, n: int) -> Table:
     reach = np.zeros((below.size, 2), np.uint32)
     reach[:, 1] = np.arange(below.size) * plane.depth
     bias = below.size * plane.depth
-    return Table(reach, plane.depth, plane.depth, 1, plane.depth, order.ravel(), plane, bias)
+    return ConnectionTable(
+        reach, plane.depth, plane.depth, 1, plane.depth, order.ravel(), plane, bias
+    )
 
 
-def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
+def strided_back(below: LayerPlane, kernel: int, plane: LayerPlane) -> U32:
     """Return the table of the backward pass through the second convolution, uint32 (pixels, 2).
 
     Its columns are a pixel's place in its plane, and that of tap (0, 0) in the plane below.
@@ -232,14 +238,14 @@ def _filled(values: F32, *shape: int) -> F32:
     return filled
 
 
-class Layout:
+class NetworkLayout:
     """Tables of a network, by the shapes of its matrices and the cells along a sample's side."""
 
     def __init__(self, shapes: tuple[tuple[int, ...], ...], cells: int) -> None:
         (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (out, _) = shapes
         self.shapes = shapes
         pad = max(k1 // 2, k2 // 2)
-        one = Plane(cells, c1, pad, cells + 2 * pad + 1)
+        one = LayerPlane(cells, c1, pad, cells + 2 * pad + 1)
         two = strided_plane(cells, c2, k2)
         three = full_layer(two, hidden)
         self.tables = (

@@ -41,10 +41,10 @@ from sliplab.analysis.networks.network import (
     set_weights,
     weights,
 )
-from sliplab.analysis.networks.spiking import Engine, Samples
+from sliplab.analysis.networks.spiking import Samples, SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
 
 def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
@@ -137,11 +137,16 @@ def layer_warnings(record: EpochRecord) -> tuple[str, ...]:
     return tuple(found)
 
 
-class Run:
+class TrainingRun:
     """A training between two epochs."""
 
     def __init__(
-        self, network: Network, windows: Windows, training: Training, seed: int, classes: int
+        self,
+        network: NetworkSettings,
+        windows: Windows,
+        training: Training,
+        seed: int,
+        classes: int,
     ) -> None:
         self.training = training
         self.classes = classes
@@ -260,7 +265,7 @@ class Fitted:
     """
 
     state_dict: dict[str, torch.Tensor]
-    network: Network
+    network: NetworkSettings
     windows: Windows
     training: Training
     seed: int
@@ -276,9 +281,9 @@ class Fitted:
         return self.history[self.chosen_epoch - 1]
 
     @cached_property
-    def engine(self) -> Engine:
+    def engine(self) -> SpikeEngine:
         """The event-driven engine of the network; it may count in several threads at a time."""
-        return Engine(restore(self), self.windows.cells)
+        return SpikeEngine(restore(self), self.windows.cells)
 
     def check_slip(self, model: Path | str, purpose: str) -> None:
         """Check that the classes are those of slip, for what is made for these alone.
@@ -306,7 +311,7 @@ def fit(
     train_y: metrics.Labels,
     val_x: Samples,
     val_y: metrics.Labels,
-    network: Network,
+    network: NetworkSettings,
     windows: Windows,
     training: Training,
     seed: int,
@@ -342,7 +347,7 @@ def fit(
             classes or two of one name, a state of another training.
     """
     classes = check_classes(classes)
-    run = Run(network, windows, training, seed, len(classes))
+    run = TrainingRun(network, windows, training, seed, len(classes))
     train, train_y = _check(run.trained, windows, train_x, train_y, "training")
     val, val_y = _check(run.trained, windows, val_x, val_y, "validation")
     if state is not None:
@@ -361,7 +366,7 @@ def fit(
             if training.mirror:
                 seen = train.mirrored(rng.integers(0, 4, len(train), np.uint8))
             loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
-            val_counts = Engine(run.trained, windows.cells).counts(val)
+            val_counts = SpikeEngine(run.trained, windows.cells).counts(val)
             record = epoch_record(
                 epoch,
                 loss,
@@ -429,6 +434,6 @@ def _check(
     if not len(y) or len(x) != len(y):
         raise ValueError(f"{len(x)} {what} samples and {len(y)} labels; expected as many, not none")
     try:
-        return Engine(net, windows.cells).sparse(x), y
+        return SpikeEngine(net, windows.cells).sparse(x), y
     except ValueError as error:
         raise ValueError(f"{what} {error}") from error

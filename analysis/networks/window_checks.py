@@ -19,10 +19,10 @@ from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics.classification import CLASSES, Counts, IntArray, Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.network import set_weights
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted, restore
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.storage.schema.evaluation import Classification
 
 
@@ -46,7 +46,7 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
             grouped = old.reshape(-1, len(fitted.classes), *old.shape[1:])
             values[name] = grouped[:, list(order)].reshape(old.shape)
         set_weights(net, values)
-        return Engine(net, fitted.windows.cells).counts(x)
+        return SpikeEngine(net, fitted.windows.cells).counts(x)
 
     return predict
 
@@ -136,7 +136,7 @@ def shuffled_chance(
     train: Part,
     validation: Part,
     test: Part,
-    network: Network,
+    network: NetworkSettings,
     windows: Windows,
     how: Training,
     runs: int = 8,

@@ -25,7 +25,7 @@ from sliplab.analysis.metrics.intervals import (
 )
 from sliplab.analysis.report.figures.intervals import differences
 from sliplab.analysis.report.outcomes import is_lost, lost_ms
-from sliplab.analysis.report.page import Figure, Number, Table, render_page
+from sliplab.analysis.report.page import Number, PageFigure, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.evaluation import SeedTimes, Share
@@ -110,7 +110,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Setting:
+class ReportDifference:
     """One setting, hash, seed or version in which two reports differ."""
 
     what: str
@@ -119,7 +119,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ReportComparison:
     """Compare two reports.
 
     Attributes:
@@ -127,7 +127,7 @@ class Comparison:
     """
 
     figures: Sequence[Change]
-    settings: Sequence[Setting]
+    settings: Sequence[ReportDifference]
     simulated: tuple[bool, bool]
 
     def to_json(self) -> Json:
@@ -174,22 +174,22 @@ def not_compared(path: Path) -> str | None:
     return next((why for key, why in _OTHERS.items() if f'"{key}":' in text), None)
 
 
-def compare(here: Summary, there: Summary) -> Comparison:
+def compare(here: Summary, there: Summary) -> ReportComparison:
     """Compare both reports figure by figure."""
     changes = _windows(here, there)
     for experiment in ("kinematic", "gravity", "disturbance"):
         changes += _of_trials(here, there, experiment)
     changes += _plain(here, there)
-    return Comparison(changes, _settings(here, there), (here.simulated, there.simulated))
+    return ReportComparison(changes, _settings(here, there), (here.simulated, there.simulated))
 
 
-def _settings(here: Summary, there: Summary) -> list[Setting]:
+def _settings(here: Summary, there: Summary) -> list[ReportDifference]:
     rows = []
     parts = [here.to_json(), there.to_json()]
     for name in ("simulated", "protocols", "detection", "seeds", "versions"):
         ours, theirs = (_flat(part.get(name), name) for part in parts)
         rows += [
-            Setting(what, ours.get(what), theirs.get(what))
+            ReportDifference(what, ours.get(what), theirs.get(what))
             for what in dict.fromkeys([*ours, *theirs])
             if ours.get(what) != theirs.get(what)
         ]
@@ -382,7 +382,7 @@ def _plain(here: Summary, there: Summary) -> list[Change]:
     return found
 
 
-def render(compared: Comparison, here: Path, there: Path) -> str:
+def render(compared: ReportComparison, here: Path, there: Path) -> str:
     """Render the page; everything in it is escaped but the figures' SVG."""
     simulated, other = compared.simulated
     figures = []
@@ -396,7 +396,7 @@ def render(compared: Comparison, here: Path, there: Path) -> str:
         if rows:
             label = f"difference, here less there ({axis})"
             svg = differences(rows, label, simulated=simulated or other)
-            figures.append((title, Figure(svg)))
+            figures.append((title, PageFigure(svg)))
     made = [[row.what, _short(row.here), _short(row.there)] for row in compared.settings]
     one = "The one here is" if simulated else "The one there is"
     return render_page(
@@ -437,7 +437,7 @@ def table(figures: Sequence[Change]) -> list[list[str]]:
     ]
 
 
-def _headline(compared: Comparison) -> list[Number]:
+def _headline(compared: ReportComparison) -> list[Number]:
     judged = [row for row in compared.figures if row.basis != "none"]
     beyond = sum(bool(row.beyond) for row in judged)
     by_chance = f"{len(judged) / 20:.0f} of {len(judged)} by chance"

@@ -14,16 +14,16 @@ from scipy.stats import theilslopes
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
-from sliplab.analysis.report.page import Content, Figure, Table, number
+from sliplab.analysis.report.page import Content, PageFigure, Table, number
 from sliplab.protocols import Trial
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.summary import (
+    DriftTrend,
     OneCameraSummary,
-    Quality,
-    References,
+    QualitySummary,
+    ReferenceSummary,
     ReferenceTrial,
     Summary,
-    Trend,
 )
 from sliplab.storage.schema.trial import Gate
 from sliplab.storage.trials.derived import Derived
@@ -48,12 +48,12 @@ class CollectedSection(Content):
     """
 
     template: ClassVar[str] = "collected.html"
-    quality: Quality
+    quality: QualitySummary
     source: str
-    grids: Sequence[tuple[str, str, str, Figure]]
+    grids: Sequence[tuple[str, str, str, PageFigure]]
     table: Table
 
-    def all_figures(self) -> list[Figure]:
+    def all_figures(self) -> list[PageFigure]:
         """Return the grids."""
         return [figure for *_, figure in self.grids]
 
@@ -117,7 +117,7 @@ def source_words(summary: Summary | OneCameraSummary) -> str:
     return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
 
 
-def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
+def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, PageFigure] | None:
     """Draw the trials by the first two factors; None if there are fewer."""
     names = list(item.planned.levels)[:2]
     if len(names) < 2:
@@ -148,7 +148,7 @@ def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | No
     svg = figures.collected_grid(
         shown[0], shown[1], counts, planned, axes[0], axes[1], simulated=simulated
     )
-    return item.name, names[0], names[1], Figure(svg, name=f"collected-{item.name}", data=data)
+    return item.name, names[0], names[1], PageFigure(svg, name=f"collected-{item.name}", data=data)
 
 
 @dataclass(frozen=True)
@@ -164,18 +164,18 @@ class QualitySection(Content):
     template: ClassVar[str] = "quality.html"
     stream: str
     """The stream whose rate is drawn."""
-    wear: Sequence[tuple[str, str, Trend]]
-    over: Sequence[tuple[str, Figure]]
-    references: Sequence[tuple[str, Figure]]
+    wear: Sequence[tuple[str, str, DriftTrend]]
+    over: Sequence[tuple[str, PageFigure]]
+    references: Sequence[tuple[str, PageFigure]]
     tables: Sequence[Table]
 
-    def all_figures(self) -> list[Figure]:
+    def all_figures(self) -> list[PageFigure]:
         """Return the figures of all campaigns."""
         return [figure for _, figure in (*self.over, *self.references)]
 
 
 def quality_section(
-    campaigns: Sequence[Collected], references: Mapping[str, References], *, simulated: bool
+    campaigns: Sequence[Collected], references: Mapping[str, ReferenceSummary], *, simulated: bool
 ) -> QualitySection | None:
     """Look at every campaign in the order in which it was taken; None where all were imported."""
     taken = [item for item in campaigns if item.trials and item.recorded is None]
@@ -195,7 +195,7 @@ def quality_section(
     )
 
 
-def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
+def _over_campaign(item: Collected, stream: str, simulated: bool) -> PageFigure:
     numbers = [trial.index + 1 for trial, _ in item.trials]
     records = [recording.record for _, recording in item.trials]
     rates = [getattr(record.counts, stream) / record.recorded_s for record in records]
@@ -215,7 +215,7 @@ def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
         "tightest gate (share of its limit)": shares,
         "failed attempts": [again.get(place, 0) for place in numbers],
     }
-    return Figure(svg, name=f"quality-{item.name}", data=data)
+    return PageFigure(svg, name=f"quality-{item.name}", data=data)
 
 
 def _nearest(gates: Mapping[str, Gate]) -> tuple[float, str]:
@@ -304,11 +304,11 @@ def _depth_zeros(taken: Sequence[Collected]) -> list[Table]:
     return [Table(columns, rows, caption)] if rows else []
 
 
-def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, References]:
+def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, ReferenceSummary]:
     """Return reference trials and wear by campaign, of those that take any."""
     found = {item.name: reference_trials(store, item) for item in campaigns}
     return {
-        name: References(trials=tuple(rows), wear=wear(rows))
+        name: ReferenceSummary(trials=tuple(rows), wear=wear(rows))
         for name, rows in found.items()
         if rows
     }
@@ -335,7 +335,7 @@ def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
     return found
 
 
-def wear(rows: Sequence[ReferenceTrial]) -> dict[str, Trend]:
+def wear(rows: Sequence[ReferenceTrial]) -> dict[str, DriftTrend]:
     """Return the change of each figure over 100 trials, in percent of its median, with 95 %.
 
     The slope of Theil and Sen: one odd trial does not move it. None with fewer than three trials.
@@ -348,7 +348,7 @@ def wear(rows: Sequence[ReferenceTrial]) -> dict[str, Trend]:
         if len(there) >= FEWEST and middle:
             fit = theilslopes([value for _, value in there], [place for place, _ in there], 0.95)
             slope = [1e4 * float(value) / middle for value in (fit[0], fit[2], fit[3])]
-        found[name] = Trend(
+        found[name] = DriftTrend(
             n=len(there), percent_per_100_trials=slope[0], low=slope[1], high=slope[2]
         )
     return found
@@ -360,7 +360,7 @@ def _measured(rows: Sequence[ReferenceTrial]) -> list[str]:
     return [name for name in WEAR if events or name != "hold_events_per_s"]
 
 
-def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> Figure:
+def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> PageFigure:
     places = [row.place for row in rows]
     measured = _measured(rows)
     panels = {WEAR[key][1]: [getattr(row, key) for row in rows] for key in measured}
@@ -371,4 +371,4 @@ def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> F
         "motion to first slip (ms)": [row.first_slip_ms for row in rows],
     }
     svg = figures.references(places, panels, simulated=simulated)
-    return Figure(svg, name=f"references-{name}", data=data)
+    return PageFigure(svg, name=f"references-{name}", data=data)

@@ -19,8 +19,8 @@ from sliplab.analysis.report.figures import classes as figures
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.page import (
     Content,
-    Figure,
     Number,
+    PageFigure,
     Table,
     percent,
     render_page,
@@ -234,7 +234,7 @@ class ClassNetworkSection(Content):
     strong: bool
     warnings: Sequence[str]
     methods: Table
-    training: Figure
+    training: PageFigure
     each_seed: Table
     argmax: str
     strict: str
@@ -294,9 +294,9 @@ class ConfusionSection(Content):
     """
 
     template: ClassVar[str] = "class_confusion.html"
-    confusion: Figure
+    confusion: PageFigure
     pairs: Table
-    recall: Figure
+    recall: PageFigure
     left_out: int
     classes: Table
 
@@ -313,13 +313,13 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
         key=lambda row: row.recall.share or 0.0,
     )
     rows = [
-        intervals.Share(row.name, row.recall.share, row.recall.low, row.recall.high)
+        intervals.ShareInterval(row.name, row.recall.share, row.recall.low, row.recall.high)
         for row in worst[:SHOWN]
     ]
     strict = scores.accuracy.strict
     line = None if strict is None else (strict, "all test windows")
     return ConfusionSection(
-        Figure(
+        PageFigure(
             figures.confusion_map(matrix, scores.classes, simulated=simulated),
             name="confusion",
             data={
@@ -337,7 +337,7 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
                 for n, i, j in pairs
             ],
         ),
-        Figure(
+        PageFigure(
             intervals.shares(
                 {"the worst first": rows}, "recall (%)", simulated=simulated, line=line
             ),
@@ -365,7 +365,7 @@ class LengthSection(Content):
     """Accuracy where only the beginning of each window is seen."""
 
     template: ClassVar[str] = "class_length.html"
-    figure: Figure
+    figure: PageFigure
     early: str
 
 
@@ -383,7 +383,7 @@ def _length_section(summary: ClassSummary) -> LengthSection | None:
         "windows": [row.n for row in rows],
     }
     svg = figures.accuracy_by_length(rows, chance, simulated=summary.simulated)
-    return LengthSection(Figure(svg, name="accuracy-by-length", data=data), _early_words(rows))
+    return LengthSection(PageFigure(svg, name="accuracy-by-length", data=data), _early_words(rows))
 
 
 def _early_words(rows: Sequence[LengthShare]) -> str:
@@ -400,7 +400,7 @@ class ErrorSection(Content):
     """Accuracy by condition, and recordings that were not classified rightly."""
 
     template: ClassVar[str] = "class_where.html"
-    factors: Figure | None
+    factors: PageFigure | None
     wrong: Table
     all_wrong: int
     recordings: int

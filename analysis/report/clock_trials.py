@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.storage.schema.trial import DEVICES, Clocks, Gate, SyncResult
+from sliplab.storage.schema.trial import DEVICES, Gate, SyncResult, TrialClockMaps
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import SYNC, Store
@@ -132,7 +132,7 @@ def _read(item: Collected, recording: Recording, number: int, results: Derived) 
     )
 
 
-def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClocks:
+def _device(clocks: TrialClockMaps, gates: Mapping[str, Gate], name: str) -> DeviceClocks:
     known = clocks.devices()[name]
     both = clocks.against_events_ns(name)
     uncertainty_ns = known.uncertainty_ns if both is None else both

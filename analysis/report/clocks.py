@@ -8,9 +8,9 @@ from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.clocks import uncertainty_by_trial
-from sliplab.analysis.report.page import Content, Figure, number
+from sliplab.analysis.report.page import Content, PageFigure, number
 from sliplab.protocols.timing import WIRED
-from sliplab.storage.schema.summary import Labels, Sync
+from sliplab.storage.schema.summary import LabelSummary, Sync
 from sliplab.storage.schema.trial import DEVICES
 
 PAGE = "sync.html"
@@ -33,14 +33,14 @@ def unwired(sync: Sync) -> bool:
     return any(grade not in WIRED for grade in frames_grade(sync).split(" or "))
 
 
-def given_note(labels: Labels) -> str:
+def given_note(labels: LabelSummary) -> str:
     """Return how far onsets may be off that came with the recordings."""
     if labels.given_within_ms is None:
         return "onsets of the data set, whose uncertainty is unknown"
     return f"onsets of the data set, within {number(labels.given_within_ms, 1, 'ms')}"
 
 
-def latency_note(sync: Sync, labels: Labels | None = None) -> str:
+def latency_note(sync: Sync, labels: LabelSummary | None = None) -> str:
     """Return the note under every table of latencies: the clocks' grade and uncertainty.
 
     Args:
@@ -69,7 +69,7 @@ def figure_note(sync: Sync) -> str:
     return f" {latency_note(sync)}" if unwired(sync) and both else ""
 
 
-def short_note(sync: Sync, labels: Labels | None = None) -> str:
+def short_note(sync: Sync, labels: LabelSummary | None = None) -> str:
     """Return the same for a headline latency."""
     if labels is not None and "given" in labels.error_ms.rule:
         return given_note(labels)
@@ -100,7 +100,7 @@ class ClockSection(Content):
 
     template: ClassVar[str] = "clocks.html"
     sync: Sync
-    figure: Figure | None
+    figure: PageFigure | None
     page: str | None
 
 
@@ -118,7 +118,7 @@ def clock_section(
     return ClockSection(sync, figure, PAGE if page else None)
 
 
-def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> Figure:
+def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> PageFigure:
     """Draw the uncertainty of each device in each trial."""
     starts: dict[str, int] = {}
     names: list[str] = []
@@ -139,4 +139,4 @@ def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> Figu
             drawn[title] = ([k for k, _ in there], [value for _, value in there])
     data = {f"{device}, uncertainty (µs)": values for device, values in found.items()}
     svg = uncertainty_by_trial(drawn, starts, simulated=simulated)
-    return Figure(svg, name="clocks", data={"trial": names, **data})
+    return PageFigure(svg, name="clocks", data={"trial": names, **data})

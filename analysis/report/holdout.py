@@ -16,7 +16,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, LatencyByOnset, Share
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.schema.summary import (
-    Holdout,
+    HoldoutSummary,
     HoldoutWindows,
     Kinematic,
     TrialIntervals,
@@ -26,7 +26,7 @@ COLUMNS = ("figure", "hold-out", "n")
 _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 
-def holdout_part(found: HoldoutResult) -> Holdout:
+def holdout_part(found: HoldoutResult) -> HoldoutSummary:
     """Return the part of the summary: all but single trials and dates, with intervals."""
     scored = [row.latency for row in found.rows if row.latency is not None]
     figures = {
@@ -35,7 +35,7 @@ def holdout_part(found: HoldoutResult) -> Holdout:
         "latency_ms": summarise_latency(scored),
         "lead_ms": summarise_lead(scored),
     }
-    return Holdout(
+    return HoldoutSummary(
         **figures,
         protocol_seed=found.protocol_seed,
         skin_seed=found.skin_seed,
@@ -47,7 +47,7 @@ def holdout_part(found: HoldoutResult) -> Holdout:
     )
 
 
-def holdout_rows(holdout: Holdout) -> list[list[str]]:
+def holdout_rows(holdout: HoldoutSummary) -> list[list[str]]:
     """Return figures of the hold-out campaign as rows of `COLUMNS`."""
     windows = {"strict": holdout.windows.strict, "argmax": holdout.windows.argmax}
     return _rows(windows, holdout.false_alarms, holdout.latency_ms, holdout.intervals)
@@ -63,7 +63,7 @@ class HoldoutSection(Content):
     """
 
     template: ClassVar[str] = "holdout.html"
-    holdout: Holdout | None
+    holdout: HoldoutSummary | None
     command: str
     file: str
     seeds: str
@@ -71,7 +71,7 @@ class HoldoutSection(Content):
 
 
 def holdout_section(
-    holdout: Holdout | None, kinematic: Kinematic, command: str, file: str
+    holdout: HoldoutSummary | None, kinematic: Kinematic, command: str, file: str
 ) -> HoldoutSection:
     """Compare hold-out and test trials."""
     if holdout is None:

@@ -13,7 +13,7 @@ from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.intervals import Panel, by_condition
 from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
 from sliplab.analysis.report.outcomes import LEAST, OUTCOMES, TIMES, WORDS, Conditions, times
-from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
+from sliplab.analysis.report.page import Content, PageFigure, Table, number, percent, with_interval
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.summary import (
@@ -54,7 +54,7 @@ _SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_o
 
 
 @dataclass(frozen=True)
-class Trend:
+class FactorTrend:
     """Change of a time's mean from a factor's first to its last level, with its interval."""
 
     first: str
@@ -87,10 +87,10 @@ class LatencySection(Content):
     by: Sequence[str]
     late: Sequence[tuple[str, int, float, float]]
     choices: Sequence[str]
-    trends: Mapping[str, Sequence[Trend]]
+    trends: Mapping[str, Sequence[FactorTrend]]
     latency_note: str
     clock_note: str
-    figures: Sequence[Figure]
+    figures: Sequence[PageFigure]
     statistics: Table
     accounts: Table
     levels: Sequence[Table]
@@ -197,7 +197,7 @@ def choice_note(chosen_by: str) -> str:
 
 def _figures(
     experiment: str, found: Conditions, by: Sequence[str], simulated: bool
-) -> list[Figure]:
+) -> list[PageFigure]:
     """Draw the experiment's times by condition."""
     value = {name: known.value for name, known in PAPER.items()}
     if experiment == "kinematic":
@@ -230,7 +230,7 @@ def _draw(
     lines: Mapping[str, tuple[float | None, str]],
     name: str,
     simulated: bool,
-) -> Figure:
+) -> PageFigure:
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]
@@ -246,7 +246,7 @@ def _draw(
         "trial": [trial.trial for _, trial in trials],
         **{AXES[time][0]: [getattr(trial, time) for _, trial in trials] for time in shown},
     }
-    return Figure(svg, name=name, data=data)
+    return PageFigure(svg, name=name, data=data)
 
 
 def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:
@@ -260,7 +260,7 @@ def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:
     return ", ".join(f"{causes.count(k)} {word}" for k, word in _SHORT.items() if k in causes)
 
 
-def _trends(found: Conditions, name: str) -> list[Trend]:
+def _trends(found: Conditions, name: str) -> list[FactorTrend]:
     """Compare the means at each factor's first and last level."""
     trends = []
     for factor in found.varied():
@@ -271,7 +271,7 @@ def _trends(found: Conditions, name: str) -> list[Trend]:
         span = difference(last, first)
         if span is not None:
             change = sum(last) / len(last) - sum(first) / len(first)
-            trends.append(Trend(levels[0], levels[-1], change, *span))
+            trends.append(FactorTrend(levels[0], levels[-1], change, *span))
     return trends
 
 

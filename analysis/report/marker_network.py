@@ -10,13 +10,13 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import NAME, STEP, evaluation_of
 from sliplab.analysis.evaluation.markers import make_marker_job
 from sliplab.analysis.evaluation.windows import window_intervals
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import marker_net
 from sliplab.analysis.networks.marker_net import MarkerNet
 from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.outcomes import failure_section
-from sliplab.analysis.report.page import Content, Figure, Table, percent
+from sliplab.analysis.report.page import Content, PageFigure, Table, percent
 from sliplab.analysis.report.summary import judged_part, plain_rules
 from sliplab.analysis.report.windows import (
     METHODS,
@@ -40,14 +40,14 @@ from sliplab.storage.trials.store import Store, StoreError
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedClassifier:
     """A store's classifier and its evaluation."""
 
     net: MarkerNet
     evaluation: Evaluation
 
 
-def read_judged(store: Store, campaigns: list[Collected]) -> Judged | None:
+def read_judged(store: Store, campaigns: list[Collected]) -> EvaluatedClassifier | None:
     """Read the classifier and its evaluation; None where either is missing or stale."""
     kept = Derived.of(store, STEP)
     if kept.key(NAME) is None:
@@ -56,20 +56,20 @@ def read_judged(store: Store, campaigns: list[Collected]) -> Judged | None:
         evaluation = evaluation_of(store)
         rules = evaluation.detection.values()
         said = next((rule for rule in rules if rule.choose == "protocol"), None)
-        labels = Labels(store, evaluation.reviewed is not None)
+        labels = StoreLabels(store, evaluation.reviewed is not None)
         jobs = [make_marker_job(labels, campaigns)]
         if said is not None:  # the rule was given on the command line
             jobs.append(make_marker_job(labels, campaigns, said.margin, said.smoothing))
         for job in jobs:
             if kept.fresh(NAME, job.key):
-                return Judged(marker_net.load(job.model.path), evaluation)
+                return EvaluatedClassifier(marker_net.load(job.model.path), evaluation)
     except StoreError:
         return None
     return None
 
 
 def with_classifier(
-    summary: OneCameraSummary, store: Store, campaigns: list[Collected], judged: Judged
+    summary: OneCameraSummary, store: Store, campaigns: list[Collected], judged: EvaluatedClassifier
 ) -> OneCameraSummary:
     """Add the classifier's figures, under the names that the spiking network's have."""
     evaluation = judged.evaluation
@@ -96,8 +96,8 @@ class MarkerNetworkSection(Content):
     alarms: str
     seeds: Seeds
     rules: Sequence[str]
-    confusion: Figure
-    training: Figure
+    confusion: PageFigure
+    training: PageFigure
     methods: Table
     classes: Table
 
@@ -145,7 +145,7 @@ def _network_section(
 
 
 def marker_sections(
-    store: Store, campaigns: list[Collected], summary: OneCameraSummary, judged: Judged
+    store: Store, campaigns: list[Collected], summary: OneCameraSummary, judged: EvaluatedClassifier
 ) -> list[Content]:
     """Make the sections about the classifier, in order."""
     assert summary.kinematic is not None

@@ -12,21 +12,21 @@ import numpy.typing as npt
 from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
-from sliplab.analysis.labels.reviewed import Labels as KeptLabels
+from sliplab.analysis.labels.reviewed import StoreLabels as KeptLabels
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.campaign import collected_section, quality_section, references_of
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.marker_network import (
-    Judged,
+    EvaluatedClassifier,
     marker_sections,
     read_judged,
     with_classifier,
 )
 from sliplab.analysis.report.page import (
     Content,
-    Figure,
     Number,
+    PageFigure,
     Table,
     number,
     render_page,
@@ -45,7 +45,7 @@ from sliplab.analysis.report.summary import (
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.shown import plural
-from sliplab.storage.schema.summary import Labels, MotionRate, OneCameraSummary, StepLeftOut
+from sliplab.storage.schema.summary import LabelSummary, MotionRate, OneCameraSummary, StepLeftOut
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -121,7 +121,7 @@ def one_camera_summary(
     store: Store,
     campaigns: list[Collected],
     planned_bytes: Mapping[str, int],
-    judged: Judged | None = None,
+    judged: EvaluatedClassifier | None = None,
 ) -> OneCameraSummary:
     """Make the summary.
 
@@ -134,7 +134,7 @@ def one_camera_summary(
     labels, rates = None, None
     labelled, evaluated = frames or has_labels(store, campaigns), is_evaluated(store, campaigns)
     if labelled:
-        labels = Labels(
+        labels = LabelSummary(
             error_ms=label_errors.label_errors(store, campaigns),
             rules_ms=label_errors.rules_compared(store, campaigns),
             source=label_sources(campaigns),
@@ -238,7 +238,7 @@ class RateSection(Content):
     """Event rates in the hold and over the motion."""
 
     template: ClassVar[str] = "rates.html"
-    figure: Figure
+    figure: PageFigure
     rates: Table
 
 
@@ -260,7 +260,7 @@ def one_camera_sections(
     store: Store,
     campaigns: list[Collected],
     summary: OneCameraSummary,
-    judged: Judged | None = None,
+    judged: EvaluatedClassifier | None = None,
 ) -> list[Content]:
     """Make all sections, in order."""
     simulated = summary.simulated
@@ -329,7 +329,7 @@ def _rates(
         for name, rate in rates.items()
     ]
     return RateSection(
-        Figure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
+        PageFigure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
         Table(("campaign", "trials", "in the hold (events/s)", "in the motion (events/s)"), rows),
     )
 

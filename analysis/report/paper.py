@@ -17,14 +17,21 @@ from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import AlarmRate, Share
-from sliplab.storage.schema.summary import Experiment, Network, NetworkWindows, Paper, Span, Summary
+from sliplab.storage.schema.summary import (
+    Experiment,
+    NetworkSummary,
+    NetworkWindows,
+    PaperSettings,
+    Span,
+    Summary,
+)
 
 _SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
 """A difference that no setting makes."""
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperFigure:
     """One published figure and the same figure of one network."""
 
     name: str
@@ -49,8 +56,8 @@ class PaperSection(Content):
     """
 
     template: ClassVar[str] = "paper.html"
-    paper: Paper
-    networks: Sequence[tuple[str, Network, str]]
+    paper: PaperSettings
+    networks: Sequence[tuple[str, NetworkSummary, str]]
     rows: Table
     counts: Table
     differences: Table
@@ -62,7 +69,7 @@ def paper_section(summary: Summary) -> PaperSection | None:
     if summary.paper is None:
         return None
     ending = " (simulated)" if summary.simulated else ""
-    networks: dict[str, Summary | Network] = {f"here{ending}": summary}
+    networks: dict[str, Summary | NetworkSummary] = {f"here{ending}": summary}
     networks |= {f"{_title(found)}{ending}": found for found in summary.networks.values()}
     each = [
         [*_windows(of.kinematic), *_times(of.kinematic, of.gravity, of.disturbance)]
@@ -90,31 +97,31 @@ def paper_section(summary: Summary) -> PaperSection | None:
     )
 
 
-def _title(network: Network) -> str:
+def _title(network: NetworkSummary) -> str:
     """Return a column's heading."""
     return f"{network.preset} preset" if network.preset else network.title
 
 
-def _windows(kinematic: NetworkWindows) -> list[Row]:
+def _windows(kinematic: NetworkWindows) -> list[PaperFigure]:
     known = kinematic.window_intervals
     right = kinematic.accuracy
     count = _count(known.get("accuracy"))
     rows = [
-        Row(
+        PaperFigure(
             "test accuracy of windows",
             PAPER["accuracy"].text,
             percent(right.argmax),
             _percents(known.get("accuracy")),
             count,
         ),
-        Row(
+        PaperFigure(
             "the same, a tie wrong",
             "–",
             percent(right.strict),
             _percents(kinematic.interval),
             count,
         ),
-        Row("the same, won by the margin", "–", percent(right.margin), count=count),
+        PaperFigure("the same, won by the margin", "–", percent(right.margin), count=count),
     ]
     for name, value in (
         ("precision", kinematic.precision["incipient"]),
@@ -122,7 +129,7 @@ def _windows(kinematic: NetworkWindows) -> list[Row]:
     ):
         row = known.get(f"incipient_{name}")
         rows.append(
-            Row(
+            PaperFigure(
                 f"incipient {name}",
                 PAPER[f"incipient_{name}"].text,
                 percent(value),
@@ -133,14 +140,14 @@ def _windows(kinematic: NetworkWindows) -> list[Row]:
     return [*rows, *_alarms(kinematic.false_alarms), _confused(kinematic.confusion)]
 
 
-def _alarms(found: dict[str, AlarmRate]) -> list[Row]:
+def _alarms(found: dict[str, AlarmRate]) -> list[PaperFigure]:
     """Return false alarms an hour, quiet and under nuisances, which the accuracy costs."""
     names = {QUIET: "false alarms an hour, quiet holding", DISTURBED: "the same, under nuisances"}
     rows = []
     for name, title in names.items():
         rate = found.get(name)
         count = "–" if rate is None else f"{plural(rate.clusters, 'trial')}, {rate.hours:.3f} h"
-        rows.append(Row(title, "–", rate_words(rate), count=count))
+        rows.append(PaperFigure(title, "–", rate_words(rate), count=count))
     return rows
 
 
@@ -154,25 +161,27 @@ def _count(row: Share | None) -> str:
     return "–" if row is None else f"{plural(row.trials, 'trial')} ({plural(row.n, 'window')})"
 
 
-def _confused(confusion: Sequence[Sequence[int]]) -> Row:
+def _confused(confusion: Sequence[Sequence[int]]) -> PaperFigure:
     """Find the two classes that are most often confused."""
     pairs = {(a, b): confusion[a][b] + confusion[b][a] for a in range(3) for b in range(a + 1, 3)}
     a, b = max(pairs, key=lambda pair: pairs[pair])
     name, paper = "most confused pair", PAPER["confused"].text
     if not pairs[a, b]:
-        return Row(name, paper, "none")
+        return PaperFigure(name, paper, "none")
     words = f"{CLASS_WORDS[a]} and {CLASS_WORDS[b]}"
-    return Row(name, paper, words, count=plural(pairs[a, b], "window"))
+    return PaperFigure(name, paper, words, count=plural(pairs[a, b], "window"))
 
 
-def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) -> list[Row]:
+def _times(
+    kinematic: Experiment, gravity: Experiment, disturbance: Experiment
+) -> list[PaperFigure]:
     rows = []
     for kind, found in (
         ("incipient", kinematic.latency_ms.incipient),
         ("gross", kinematic.latency_ms.gross),
     ):
         rows.append(
-            Row(
+            PaperFigure(
                 f"kinematic latency, {kind}, mean",
                 f"{PAPER[f'{kind}_latency'].text} after onset",
                 number(found.mean, 0, "ms"),
@@ -184,7 +193,7 @@ def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) 
     first = "{0.detected_first} of {0.planned} trials detected first"
     if gravity.accounted.planned:
         rows.append(
-            Row(
+            PaperFigure(
                 "gravity lead, smallest",
                 PAPER["gravity_lead"].text,
                 number(gravity.lead_ms.min, 0, "ms"),
@@ -194,7 +203,7 @@ def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) 
     if disturbance.accounted.planned:
         lead = disturbance.lead_ms
         rows.append(
-            Row(
+            PaperFigure(
                 "disturbance lead, mean ± standard deviation",
                 PAPER["disturbance_lead"].text,
                 f"{number(lead.mean, 0)} ± {number(lead.std, 0, 'ms')}",

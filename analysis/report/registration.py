@@ -9,7 +9,7 @@ from typing import ClassVar
 from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.networks.models import rules_of, training_settings
-from sliplab.analysis.registration import Deviation, campaign_deviations
+from sliplab.analysis.registration import RegistrationDeviation, campaign_deviations
 from sliplab.analysis.report.page import Content, Table
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data
@@ -79,7 +79,7 @@ def registration_section(store: Store, campaigns: list[Collected]) -> Registrati
 
 def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Registered:
     files: list[list[str]] = []
-    found: list[Deviation] = []
+    found: list[RegistrationDeviation] = []
     after, rig = "", False
     try:
         for path, each in registrations(item.campaign):
@@ -90,7 +90,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
                 found += campaign_deviations(item, each, path)
                 found += _evaluation_deviations(store, campaigns, item)
         problems = [
-            Deviation("damaged registration", "–", f"{path.name}: {what}")
+            RegistrationDeviation("damaged registration", "–", f"{path.name}: {what}")
             for path, what in registration_problems(item.campaign)
         ]
         if problems:  # what the files state of their time proves nothing
@@ -98,7 +98,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
             after = "but its registrations are damaged, missing or changed"
     except (InputError, StoreError) as error:
         after = after or "but cannot be read"
-        found.append(Deviation("a file cannot be read", "–", str(error)))
+        found.append(RegistrationDeviation("a file cannot be read", "–", str(error)))
     return Registered(
         item.name,
         after,
@@ -110,7 +110,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
 
 def _evaluation_deviations(
     store: Store, campaigns: list[Collected], item: Collected
-) -> Iterator[Deviation]:
+) -> Iterator[RegistrationDeviation]:
     """Yield options of `sliplab evaluate` that took the place of the protocol's settings."""
     try:
         evaluation = evaluation_of(store)
@@ -118,7 +118,9 @@ def _evaluation_deviations(
         return
     if evaluation.reviewed is not None:
         states = ", ".join(f"{n} {state}" for state, n in evaluation.reviewed.items())
-        yield Deviation("evaluate --reviewed", "–", f"review decisions are applied: {states}")
+        yield RegistrationDeviation(
+            "evaluate --reviewed", "–", f"review decisions are applied: {states}"
+        )
     rule = evaluation.detection.get(item.name)
     if rule is None or rule.choose != "protocol":
         return
@@ -128,4 +130,4 @@ def _evaluation_deviations(
     values = [f"smoothing {each.smoothing}, margin {each.margin:g}" for each in (planned, rule)]
     if chosen or values[0] != values[1]:
         settings = "chosen by trials" if chosen else values[0]
-        yield Deviation("evaluate --smoothing, --margin", settings, values[1])
+        yield RegistrationDeviation("evaluate --smoothing, --margin", settings, values[1])

@@ -40,7 +40,7 @@ from sliplab.storage.schema.summary import SeedsUsed, Summary
 
 
 @dataclass(frozen=True)
-class Shown:
+class ReportMaterial:
     """Material of the page besides the summary's numbers.
 
     Attributes:
@@ -53,7 +53,7 @@ class Shown:
     distances: Mapping[str, Mapping[str, Sequence[float]]]
 
 
-def read_shown(sources: Sources) -> Shown:
+def read_shown(sources: Sources) -> ReportMaterial:
     """Read what the page shows besides the summary's numbers."""
     store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
     models = wanted_models(store, campaigns, evaluation.reviewed is not None)
@@ -64,7 +64,7 @@ def read_shown(sources: Sources) -> Shown:
         rule = evaluation.detection[example.item.name]
         trial = example.recording.trial_id
         counts = trial_counts(store, example.item.name, trial, rule)
-    return Shown(
+    return ReportMaterial(
         model_file.load(model.path),
         None if example is None else (example, counts),
         label_errors.distances(store, campaigns),
@@ -108,7 +108,7 @@ def headline(summary: Summary) -> list[Number]:
     ]
 
 
-def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Content]:
+def make_sections(sources: Sources, summary: Summary, shown: ReportMaterial) -> list[Content]:
     """Make all sections, in order.
 
     Raises:

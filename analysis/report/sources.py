@@ -13,7 +13,7 @@ from sliplab.analysis.evaluation import networks as other_networks
 from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.plugin_sections import sections_key
@@ -27,7 +27,7 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
-from sliplab.storage.schema.summary import Hold
+from sliplab.storage.schema.summary import HoldSummary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
@@ -64,7 +64,7 @@ class Sources:
     baselines: Mapping[str, TrainedBaseline]
     window_intervals: WindowIntervals | None
     label_check: LabelCheck | None
-    holds: Mapping[str, Hold]
+    holds: Mapping[str, HoldSummary]
     planned_bytes: Mapping[str, int]
     step_seconds: Mapping[str, float]
     programs: Mapping[str, Json]
@@ -120,7 +120,7 @@ def read_sources(
         StoreError: there is no evaluation of this version yet.
     """
     evaluation = evaluation_of(store)
-    labels = Labels(store, evaluation.reviewed is not None)
+    labels = StoreLabels(store, evaluation.reviewed is not None)
     return Sources(
         store,
         campaigns,

@@ -30,11 +30,11 @@ from sliplab.storage.schema.evaluation import (
 )
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.schema.summary import (
-    Difference,
     Hashes,
-    Paper,
+    PaperSettings,
     Planned,
-    Quality,
+    QualitySummary,
+    SettingDifference,
     Summary,
     Sync,
 )
@@ -214,7 +214,7 @@ def plain_rules(rules: Mapping[str, Detection]) -> dict[str, Json]:
     return {name: rule.model_dump(mode="json") for name, rule in rules.items()}
 
 
-def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
+def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> PaperSettings:
     """Find in which settings this differs from the paper, and which of them it does not say."""
     depths = {
         text
@@ -227,7 +227,7 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
         for text in item.plan.level_texts(field, unit)
     }
     differences = tuple(
-        Difference(
+        SettingDifference(
             setting=each.words,
             key=each.key,
             paper=_in_words(each.value),
@@ -245,7 +245,7 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
         assumed.append(
             f"press depth of gravity and disturbance trials: {', '.join(sorted(depths))}"
         )
-    return Paper(preset=settings.preset, differences=differences, assumed=tuple(assumed))
+    return PaperSettings(preset=settings.preset, differences=differences, assumed=tuple(assumed))
 
 
 def _in_words(value: Any) -> str:
@@ -305,11 +305,11 @@ def sync_part(campaigns: Sequence[Collected]) -> Sync:
     )
 
 
-def quality_part(campaigns: Sequence[Collected]) -> Quality:
+def quality_part(campaigns: Sequence[Collected]) -> QualitySummary:
     """Count trials and attempts of all campaigns."""
     quarantined = [known for item in campaigns for known in item.campaign.quarantined()]
     broken_off = sum(known["cause"] == "interrupted" for known in quarantined)
-    return Quality(
+    return QualitySummary(
         planned=sum(len(item.planned) for item in campaigns),
         committed=sum(len(item.trials) for item in campaigns),
         retaken=sum(str(known["cause"]).startswith("gate") for known in quarantined),

@@ -16,14 +16,14 @@ from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.figures import windows as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
-from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.analysis.report.page import Content, PageFigure, Table, number, percent
 from sliplab.analysis.report.published import PAPER, Published
 from sliplab.protocols.quantity import level_order
 from sliplab.storage.schema.classes import JudgedClasses
 from sliplab.storage.schema.evaluation import (
     Accuracy,
     Baseline,
-    Calibration,
+    ProbabilityCalibration,
     Seeds,
     Share,
     TrainedBaseline,
@@ -72,8 +72,8 @@ class NetworkSection(Content):
     """Stronger methods were trained."""
     warnings: Sequence[str]
     paper: Mapping[str, Published]
-    confusion: Figure
-    training: Figure
+    confusion: PageFigure
+    training: PageFigure
     methods: Table
     classes: Table
 
@@ -111,14 +111,14 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
     )
 
 
-def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> Figure:
+def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> PageFigure:
     """Draw the confusion matrix."""
     confusion = np.asarray(kinematic.confusion)
     called = {
         f"called {word} (windows)": confusion[:, k].tolist()
         for k, word in enumerate((*CLASS_WORDS, "undecided"))
     }
-    return Figure(
+    return PageFigure(
         figures.confusion(confusion, simulated=simulated),
         name="confusion",
         data={"true class": list(CLASS_WORDS), **called},
@@ -127,13 +127,13 @@ def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> Figure:
 
 def training_figure(
     history: Sequence[dict[str, Any]], chosen_epoch: int, *, simulated: bool
-) -> Figure:
+) -> PageFigure:
     """Draw loss and accuracy over the epochs.
 
     Args:
         history: a row for each epoch, by the names in `_HEADINGS`.
     """
-    return Figure(
+    return PageFigure(
         figures.training_curves(history, chosen_epoch, simulated=simulated),
         name="training",
         data={heading: [row[name] for row in history] for name, heading in _HEADINGS.items()},
@@ -160,8 +160,8 @@ class WhereSection(Content):
     """
 
     template: ClassVar[str] = "where.html"
-    tenths: Figure
-    factors: Figure | None
+    tenths: PageFigure
+    factors: PageFigure | None
     levels: Table
     still: Table
     worst: Table
@@ -206,7 +206,7 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
         dtype=object,
     )
     return WhereSection(
-        Figure(
+        PageFigure(
             figures.recall_by_tenth(kinematic.by_tenth, simulated=simulated),
             name="recall-by-tenth",
             data={str(name): column for name, column in tenths.to_dict("list").items()},
@@ -226,18 +226,19 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
 
 def factor_figure(
     by_factor: Mapping[str, Mapping[str, Share]], accuracy: Accuracy, *, simulated: bool
-) -> Figure:
+) -> PageFigure:
     """Draw accuracy by each factor's levels, next to that of all windows."""
     strict = accuracy.strict
     groups = {
         factor: [
-            intervals.Share(level, row.share, row.low, row.high) for level, row in _in_order(rows)
+            intervals.ShareInterval(level, row.share, row.low, row.high)
+            for level, row in _in_order(rows)
         ]
         for factor, rows in by_factor.items()
     }
     line = None if strict is None else (strict, "all test windows")
     named = [replace(it, name=f"{factor} {it.name}") for factor, of in groups.items() for it in of]
-    return Figure(
+    return PageFigure(
         intervals.shares(
             groups, "windows classified correctly (%)", simulated=simulated, line=line
         ),
@@ -247,7 +248,7 @@ def factor_figure(
 
 
 def share_data(
-    rows: Sequence[intervals.Share], what: str = "strict accuracy"
+    rows: Sequence[intervals.ShareInterval], what: str = "strict accuracy"
 ) -> dict[str, Sequence[object]]:
     """Return drawn shares as columns."""
     return {
@@ -268,8 +269,8 @@ class LeadSection(Content):
     """Share of right windows by the winner's lead in spikes."""
 
     template: ClassVar[str] = "lead.html"
-    calibration: Calibration
-    figure: Figure
+    calibration: ProbabilityCalibration
+    figure: PageFigure
 
 
 def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None:
@@ -287,11 +288,11 @@ def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None
     rows = kinematic.reliability
     data = {heading: [getattr(row, key) for row in rows] for key, heading in headings.items()}
     svg = figures.reliability(rows, simulated=simulated)
-    return LeadSection(kinematic.calibration, Figure(svg, name="lead-reliability", data=data))
+    return LeadSection(kinematic.calibration, PageFigure(svg, name="lead-reliability", data=data))
 
 
 @dataclass(frozen=True)
-class Rival:
+class BestBaseline:
     """The best other method on these windows.
 
     Attributes:
@@ -320,7 +321,7 @@ class WorkSection(Content):
     template: ClassVar[str] = "work.html"
     work: WindowWork
     seeds: Seeds
-    rival: Rival | None
+    rival: BestBaseline | None
     layers: Table
     fired: Table
     others: Table
@@ -349,7 +350,7 @@ def work_section(scores: Kinematic | JudgedClasses) -> WorkSection | None:
     )
 
 
-def _rival(scores: Kinematic | JudgedClasses) -> Rival | None:
+def _rival(scores: Kinematic | JudgedClasses) -> BestBaseline | None:
     """Find the best other method, where stronger ones were trained."""
     every: dict[str, Baseline] = {**scores.beside, **scores.trained_baselines}
     known = {name: row for name, row in every.items() if row.argmax is not None}
@@ -358,7 +359,7 @@ def _rival(scores: Kinematic | JudgedClasses) -> Rival | None:
     best = max(known, key=lambda name: known[name].argmax or 0.0)
     found = known[best]
     made = found.made if isinstance(found, TrainedBaseline) else {}
-    return Rival(METHODS[best], found, made.get("multiply_adds"), _shares(made))
+    return BestBaseline(METHODS[best], found, made.get("multiply_adds"), _shares(made))
 
 
 def _others(baselines: Mapping[str, TrainedBaseline]) -> Table:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels.event_labels import SLICE_NS, crossing_intervals
-from sliplab.analysis.labels.onsets import Onsets as MarkerOnsets
+from sliplab.analysis.labels.onsets import LabelOnsets as MarkerOnsets
 from sliplab.analysis.labels.onsets import last_off_axis
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.labels.slip_times import WIDEST_NS
@@ -28,7 +28,7 @@ from sliplab.storage.schema.label import KINDS, LABELS, Kind, RuleOnsets, TrialL
 from sliplab.storage.streams import F64, I64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.review import Decision, Onsets, last
+from sliplab.storage.trials.review import Decision, ReviewedOnsets, last
 from sliplab.storage.trials.store import Store
 
 GRAVE, ODD, SLIGHT = 3, 2, 1
@@ -46,7 +46,7 @@ _NORMAL = 1.4826
 
 
 @dataclass(frozen=True)
-class Labelled:
+class ReviewedTrial:
     """A trial with its present label and the last decision on it."""
 
     item: Collected
@@ -78,7 +78,7 @@ class LabelDoubt:
         severity: of the gravest reason, 0 for none. reasons: as text, gravest first.
     """
 
-    onsets: Onsets
+    onsets: ReviewedOnsets
     end_ns: int
     spread_ms: Mapping[Kind, float]
     unusable: float
@@ -109,7 +109,7 @@ class LabelDoubt:
         return incipient, np.maximum(incipient, gross), chance >= self.unusable
 
 
-def labelled_trials(store: Store, item: Collected) -> list[Labelled]:
+def labelled_trials(store: Store, item: Collected) -> list[ReviewedTrial]:
     """Return a campaign's trials whose label is of the trial and settings as they are now.
 
     Raises:
@@ -117,7 +117,7 @@ def labelled_trials(store: Store, item: Collected) -> list[Labelled]:
     """
     derived = Derived.of(store, LABELS, item.name)
     return [
-        Labelled(
+        ReviewedTrial(
             item,
             trial,
             recording,
@@ -148,7 +148,7 @@ def reasons_for_doubt(label: TrialLabel) -> list[tuple[int, str]]:
     return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 
 
-def suggested_onsets(label: TrialLabel, centre: int) -> Onsets:
+def suggested_onsets(label: TrialLabel, centre: int) -> ReviewedOnsets:
     """Return the onsets by the label's rule, in doubt or not.
 
     Args:
@@ -161,10 +161,10 @@ def suggested_onsets(label: TrialLabel, centre: int) -> Onsets:
         incipient = min(slipped, default=None)
     if gross is None and centre < len(label.per_marker_ns) and label.per_marker_ns[centre] >= 0:
         gross = label.per_marker_ns[centre]
-    return Onsets(incipient, gross)
+    return ReviewedOnsets(incipient, gross)
 
 
-def unusable_shares(cases: Sequence[Labelled]) -> dict[int, float]:
+def unusable_shares(cases: Sequence[ReviewedTrial]) -> dict[int, float]:
     """Return the share of trials that a review leaves without onsets, by severity.
 
     The assumed one, and the decisions so far, each trial as one.
@@ -183,7 +183,7 @@ def unusable_shares(cases: Sequence[Labelled]) -> dict[int, float]:
 
 
 def doubts_of(
-    store: Store, cases: Sequence[Labelled], unusable: Mapping[int, float]
+    store: Store, cases: Sequence[ReviewedTrial], unusable: Mapping[int, float]
 ) -> list[LabelDoubt]:
     """Return the doubt of each label of one campaign.
 
@@ -220,7 +220,7 @@ def _severity(reasons: Sequence[tuple[int, str]]) -> int:
     return reasons[0][0] if reasons else 0
 
 
-def _frame_ms(case: Labelled) -> float:
+def _frame_ms(case: ReviewedTrial) -> float:
     """Return the interval of two frames, or of the slices that replace them; 0 without either."""
     record = case.recording.record
     if record.counts.frames and record.recorded_s:
@@ -228,7 +228,7 @@ def _frame_ms(case: Labelled) -> float:
     return SLICE_NS / 1e6 if case.label.source == "events" else 0.0
 
 
-def _spreads_ms(store: Store, case: Labelled, onsets: Onsets) -> dict[Kind, float]:
+def _spreads_ms(store: Store, case: ReviewedTrial, onsets: ReviewedOnsets) -> dict[Kind, float]:
     """Standard deviation of either onset by its own interval, or in doubt since the motion."""
     label, found = case.label, dict[Kind, float]()
     intervals = _stated(case) or _crossed(store, case)
@@ -243,7 +243,7 @@ def _spreads_ms(store: Store, case: Labelled, onsets: Onsets) -> dict[Kind, floa
     return found
 
 
-def _stated(case: Labelled) -> dict[Kind, tuple[int, int] | None]:
+def _stated(case: ReviewedTrial) -> dict[Kind, tuple[int, int] | None]:
     """Return the central 95 % of the onsets that the label itself states, ns."""
     label, slips = case.label, case.label.change_point
     if label.rule == "change_point" and slips is not None:
@@ -255,7 +255,7 @@ def _stated(case: Labelled) -> dict[Kind, tuple[int, int] | None]:
     return {}
 
 
-def _crossed(store: Store, case: Labelled) -> dict[Kind, tuple[int, int] | None]:
+def _crossed(store: Store, case: ReviewedTrial) -> dict[Kind, tuple[int, int] | None]:
     """Return when markers in frames, give or take two deviations, cross the paper's threshold."""
     label, settings = case.label, case.item.settings.labelling
     if label.rule != "paper" or label.paper is None or label.doubts.incipient:
@@ -282,7 +282,7 @@ def _marker_onsets(found: RuleOnsets) -> MarkerOnsets:
     return MarkerOnsets(found.incipient_ns, found.gross_ns, found.first_marker, times)
 
 
-def _centre(case: Labelled, found: RuleOnsets) -> int:
+def _centre(case: ReviewedTrial, found: RuleOnsets) -> int:
     """Return the marker whose slip is the gross onset."""
     centre = case.recording.record.geometry.centre
     twists = case.recording.motion_phase == "twist"
@@ -290,7 +290,7 @@ def _centre(case: Labelled, found: RuleOnsets) -> int:
 
 
 def _rules_apart(
-    cases: Sequence[Labelled], onsets: Sequence[Onsets]
+    cases: Sequence[ReviewedTrial], onsets: Sequence[ReviewedOnsets]
 ) -> dict[tuple[int, Kind], tuple[float, str]]:
     """Return the excess distance of rules over that in similar trials, ms, and the rule.
 

@@ -39,7 +39,7 @@ Name = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ReviewDraws:
     """Random review outcomes of one trial: 2 DRAWS of them.
 
     Attributes:
@@ -51,13 +51,13 @@ class Drawn:
     usable: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
     @staticmethod
-    def of(name: Name, doubt: LabelDoubt) -> Drawn:
+    def of(name: Name, doubt: LabelDoubt) -> ReviewDraws:
         """Draw reviews of a trial, the same at every call."""
-        return Drawn(*doubt.draw(2 * DRAWS, hash_integer("review", *name)))
+        return ReviewDraws(*doubt.draw(2 * DRAWS, hash_integer("review", *name)))
 
 
 @dataclass(frozen=True)
-class Figure:
+class ReviewStatistic:
     """A statistic over n trials, now and as reviews may leave it.
 
     Of a mean it is a sum over a sum: values over trials, or hits over windows.
@@ -140,8 +140,8 @@ def _statistic(statistic: str, sums: F64, sizes: F64) -> F64:
 
 
 def time_figures(
-    evaluation: Evaluation, doubts: Mapping[Name, LabelDoubt], drawn: Mapping[Name, Drawn]
-) -> list[Figure]:
+    evaluation: Evaluation, doubts: Mapping[Name, LabelDoubt], drawn: Mapping[Name, ReviewDraws]
+) -> list[ReviewStatistic]:
     """Return median and mean of each time of each experiment's test trials.
 
     Args:
@@ -172,7 +172,7 @@ def time_figures(
                 if span is not None and not np.isfinite(span).all():
                     span = None
                 found.append(
-                    Figure(
+                    ReviewStatistic(
                         f"{statistic} {title}",
                         experiment,
                         "ms",
@@ -205,7 +205,7 @@ def _counted(times: F64, statistic: str) -> tuple[F64, F64]:
     return np.where(there, times, 0.0), there.astype(np.float64)
 
 
-def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: Drawn) -> dict[str, F64]:
+def _times(row: TrialScore, tolerance_ns: int, end_ns: int, drawn: ReviewDraws) -> dict[str, F64]:
     """Return the times of a trial's detections, ms, in each draw; see `_time`."""
 
     def since(found_ns: int | None, onset_ns: I64, end_ns: I64) -> F64:
@@ -230,8 +230,8 @@ def accuracy_figure(
     samples: SampleSet,
     counts: I64,
     length_ns: int,
-    drawn: Mapping[Name, Drawn],
-) -> Figure:
+    drawn: Mapping[Name, ReviewDraws],
+) -> ReviewStatistic:
     """Return strict accuracy of the test windows.
 
     Args:
@@ -251,7 +251,7 @@ def accuracy_figure(
                 np.where(draw.usable, ours.sum(), 0).astype(np.float64),
             )
     known = evaluation.windows.interval
-    return Figure(
+    return ReviewStatistic(
         "strict accuracy",
         "kinematic",
         "share",
@@ -264,7 +264,7 @@ def accuracy_figure(
     )
 
 
-def drawn_classes(middle_ns: I64, drawn: Drawn) -> I64:
+def drawn_classes(middle_ns: I64, drawn: ReviewDraws) -> I64:
     """Return the class of each window in each draw, (n, 2 DRAWS): 0 no slip, 1, 2 gross.
 
     Args:
@@ -275,7 +275,7 @@ def drawn_classes(middle_ns: I64, drawn: Drawn) -> I64:
 
 
 def trained_shares(
-    parts: Sequence[SampleSet], length_ns: int, per_class: int, drawn: Mapping[Name, Drawn]
+    parts: Sequence[SampleSet], length_ns: int, per_class: int, drawn: Mapping[Name, ReviewDraws]
 ) -> dict[Name, float]:
     """Return the expected share of the windows of some parts that a review of a trial changes.
 

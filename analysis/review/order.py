@@ -16,15 +16,15 @@ from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.evaluation.windows import kept_counts
 from sliplab.analysis.review.doubt import (
     LabelDoubt,
-    Labelled,
+    ReviewedTrial,
     doubts_of,
     labelled_trials,
     unusable_shares,
 )
 from sliplab.analysis.review.influence import (
-    Drawn,
-    Figure,
     Name,
+    ReviewDraws,
+    ReviewStatistic,
     accuracy_figure,
     time_figures,
     trained_shares,
@@ -45,7 +45,7 @@ _NORMAL_95 = 3.92
 
 
 @dataclass(frozen=True)
-class Move:
+class ExpectedChange:
     """The expected change of one figure by the review of one trial.
 
     Attributes:
@@ -70,7 +70,7 @@ class Waiting:
     trial: str
     split: str
     doubt: LabelDoubt
-    moves: tuple[Move, ...]
+    moves: tuple[ExpectedChange, ...]
 
     @property
     def name(self) -> Name:
@@ -112,7 +112,7 @@ class ReviewOrder:
     """
 
     trials: Sequence[Waiting]
-    figures: Sequence[Figure]
+    figures: Sequence[ReviewStatistic]
     notes: Sequence[str]
 
     def gains(self, count: int) -> list[Gain]:
@@ -146,7 +146,7 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
     every = {item.name: labelled_trials(store, item) for item in campaigns}
     unusable = unusable_shares([case for cases in every.values() for case in cases])
     doubts: dict[Name, LabelDoubt] = {}
-    waiting: list[Labelled] = []
+    waiting: list[ReviewedTrial] = []
     for cases in every.values():
         for case, doubt in zip(cases, doubts_of(store, cases, unusable), strict=True):
             if case.state in {"open", "stale"}:
@@ -165,10 +165,10 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
             f"the evaluation does not use the {decided} decisions that there are: "
             "`sliplab evaluate --reviewed` does"
         )
-    figures: list[Figure] = []
+    figures: list[ReviewStatistic] = []
     shares: dict[Name, float] = {}
     if evaluation is not None:
-        drawn = {name: Drawn.of(name, doubt) for name, doubt in doubts.items()}
+        drawn = {name: ReviewDraws.of(name, doubt) for name, doubt in doubts.items()}
         figures = time_figures(evaluation, doubts, drawn)
         windows, shares = _windows(store, campaigns, evaluation, drawn)
         figures += windows
@@ -195,7 +195,9 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
     return ReviewOrder(trials, figures, notes)
 
 
-def _evaluation(store: Store, waiting: Sequence[Labelled]) -> tuple[Evaluation | None, list[str]]:
+def _evaluation(
+    store: Store, waiting: Sequence[ReviewedTrial]
+) -> tuple[Evaluation | None, list[str]]:
     """Return the evaluation, if it is of the labels as they are, and else why there is none."""
     try:
         found = evaluation_of(store)
@@ -216,8 +218,11 @@ def _evaluation(store: Store, waiting: Sequence[Labelled]) -> tuple[Evaluation |
 
 
 def _windows(
-    store: Store, campaigns: Sequence[Collected], evaluation: Evaluation, drawn: dict[Name, Drawn]
-) -> tuple[list[Figure], dict[Name, float]]:
+    store: Store,
+    campaigns: Sequence[Collected],
+    evaluation: Evaluation,
+    drawn: dict[Name, ReviewDraws],
+) -> tuple[list[ReviewStatistic], dict[Name, float]]:
     """Return the accuracy of the test windows, if they were stored, and shares of training windows.
 
     The shares are by trial, of windows that its review changes.
@@ -254,8 +259,8 @@ def _network_error(evaluation: Evaluation | None) -> float | None:
 
 
 def _moves(
-    name: Name, figures: Sequence[Figure], trained: float, error: float | None
-) -> tuple[Move, ...]:
+    name: Name, figures: Sequence[ReviewStatistic], trained: float, error: float | None
+) -> tuple[ExpectedChange, ...]:
     """Return the figures that a review of a trial may move, the most of its interval first."""
     found = []
     for figure in figures:
@@ -264,7 +269,7 @@ def _moves(
         if (known != 0).any():
             change = float(np.abs(known).mean())
             found.append(
-                Move(
+                ExpectedChange(
                     figure.name,
                     figure.experiment,
                     figure.unit,
@@ -275,5 +280,5 @@ def _moves(
             )
     if trained:
         of_interval = None if error is None else trained * error
-        found.append(Move(TRAINING, "kinematic", "share", trained, None, of_interval))
+        found.append(ExpectedChange(TRAINING, "kinematic", "share", trained, None, of_interval))
     return tuple(sorted(found, key=lambda move: -(move.of_interval or 0.0)))

@@ -185,7 +185,7 @@ class Sweep(Generic[P]):
 
 
 @dataclass(frozen=True)
-class Task:
+class SweepTask:
     """A point that measures itself."""
 
     name: str
@@ -198,7 +198,7 @@ class Task:
         return self.name
 
 
-def task_sweep(tasks: Sequence[Task], results: Results) -> Sweep[Task]:
+def task_sweep(tasks: Sequence[SweepTask], results: Results) -> Sweep[SweepTask]:
     """Return the sweep of tasks, each of which counts as one."""
     return Sweep(tasks, results, lambda task, advance: (task.work(), None))
 

@@ -22,7 +22,7 @@ from sliplab.analysis.labels.places import TRACKS_PLATE_PX, Places
 from sliplab.analysis.labels.plane import plane_of
 from sliplab.analysis.labels.plate_tracking import PlateTrack
 from sliplab.analysis.labels.rest import offsets
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.dataset import TrialId
 from sliplab.protocols.hashing import hash_integer
@@ -61,7 +61,9 @@ class MarkerSamples:
         return len(self.y)
 
 
-def marker_displacements(labels: Labels, item: Collected, recording: Recording) -> tuple[I64, F64]:
+def marker_displacements(
+    labels: StoreLabels, item: Collected, recording: Recording
+) -> tuple[I64, F64]:
     """Return the displacement of a labelled trial's markers from the start of the hold.
 
     The markers' places are those that the label was read from; the video is not tracked again.
@@ -177,7 +179,9 @@ def choose_frames(
     return chosen
 
 
-def load_marker_samples(labels: Labels, campaigns: list[Collected], split: str) -> MarkerSamples:
+def load_marker_samples(
+    labels: StoreLabels, campaigns: list[Collected], split: str
+) -> MarkerSamples:
     """Return the samples of all trials of one split of the kinematic campaigns.
 
     Raises:

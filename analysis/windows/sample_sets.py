@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import EachTrial, TrialWork, in_order
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import Samples, Windows
+from sliplab.protocols.settings import SampleSettings, Windows
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
@@ -38,7 +38,7 @@ class _SampleInputs:
     label: TrialLabel
     trial: TrialId
     windows: Windows
-    samples: Samples
+    samples: SampleSettings
     seed: int
     classes: tuple[str, ...] = ()
     """Of recordings that show classes of their own."""
@@ -67,7 +67,7 @@ def several(campaigns: list[Collected]) -> list[str]:
 
 
 def load_samples(
-    labels: Labels, campaigns: list[Collected], split: str, each: EachTrial = in_order
+    labels: StoreLabels, campaigns: list[Collected], split: str, each: EachTrial = in_order
 ) -> SampleSet:
     """Load the samples of all trials of one split of the kinematic campaigns, mapped from a file.
 
@@ -78,14 +78,18 @@ def load_samples(
 
 
 def load_class_samples(
-    labels: Labels, campaigns: list[Collected], split: str, each: EachTrial = in_order
+    labels: StoreLabels, campaigns: list[Collected], split: str, each: EachTrial = in_order
 ) -> SampleSet:
     """Load the samples of all trials of one split of campaigns of classes; see `load_samples`."""
     return _load(labels, agreeing(campaigns), split, each, class_names(campaigns))
 
 
 def _load(
-    labels: Labels, used: list[Collected], split: str, each: EachTrial, classes: tuple[str, ...]
+    labels: StoreLabels,
+    used: list[Collected],
+    split: str,
+    each: EachTrial,
+    classes: tuple[str, ...],
 ) -> SampleSet:
     windows = used[0].settings.windows
     trials = [(item, trial, found) for item in used for trial, found in item.of_split(split)]
@@ -111,7 +115,7 @@ def _load(
 
 
 def _make(
-    labels: Labels,
+    labels: StoreLabels,
     trials: list[TrialRef],
     windows: Windows,
     each: EachTrial,

@@ -11,7 +11,7 @@ from sliplab.analysis.report.figures.style import BLUE, GREY, ORANGE, STYLE, WID
 
 
 @dataclass(frozen=True)
-class Changed:
+class FigureChange:
     """Change of a figure at one setting; 0 is unchanged.
 
     Attributes:
@@ -34,8 +34,8 @@ class ChangePanel:
     """
 
     label: str
-    lower: Mapping[str, Changed]
-    higher: Mapping[str, Changed]
+    lower: Mapping[str, FigureChange]
+    higher: Mapping[str, FigureChange]
     note: str
 
 

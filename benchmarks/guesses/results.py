@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from benchmarks.guesses.document import SensitivityResults, SettingScores, TrialAtSetting
-from benchmarks.scene_parameters import CHANGE, Setting
+from benchmarks.scene_parameters import CHANGE, ParameterSetting
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.evaluation.trials import judge, summaries
@@ -75,7 +75,7 @@ class StudySensitivity:
         """The study's network."""
         return model_file.load(self.model.path)
 
-    def key(self, setting: Setting) -> str:
+    def key(self, setting: ParameterSetting) -> str:
         """Return the key of a setting's results."""
         made_of = [
             [item.name, item.plan.collection_hash, item.info["rig_hash"], self.trials[item.name]]
@@ -87,7 +87,11 @@ class StudySensitivity:
         return make_key(STEP, VERSION, inputs, [setting.parameter, setting.factor])
 
     def score(
-        self, setting: Setting, value: float | None, store: Store, campaigns: list[Collected]
+        self,
+        setting: ParameterSetting,
+        value: float | None,
+        store: Store,
+        campaigns: list[Collected],
     ) -> SettingScores:
         """Score the trials that were repeated at a setting.
 

@@ -15,9 +15,9 @@ from functools import partial
 
 from benchmarks.guesses.document import SettingScores
 from benchmarks.guesses.results import Figures, StudySensitivity, figures
-from benchmarks.scene_parameters import NAMES, Setting, in_all, lower_and_higher
+from benchmarks.scene_parameters import NAMES, ParameterSetting, in_all, lower_and_higher
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.sweeps.runner import Sweep, Task, task_sweep
+from sliplab.analysis.sweeps.runner import Sweep, SweepTask, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
@@ -29,7 +29,7 @@ TRIALS = 20
 
 
 @dataclass(frozen=True)
-class Measured:
+class SettingsMeasured:
     """The settings that were requested, by name.
 
     Attributes:
@@ -46,7 +46,7 @@ class Measured:
 
 def measure_guesses(
     store: Store, campaigns: list[Collected], guesses: Sequence[str], trials: int
-) -> Measured:
+) -> SettingsMeasured:
     """Measure what is missing; return the figures of all settings that were requested.
 
     Args:
@@ -63,7 +63,7 @@ def measure_guesses(
         begin=lambda number, count, task: console.say(f"[{number}/{count}] {task.name} (simulated)")
     )
     kept = work.results.load().settings
-    return Measured(
+    return SettingsMeasured(
         {name: len(ids) for name, ids in work.trials.items()},
         measured,
         {task.name: figures(kept[task.name]) for task in sweep.points},
@@ -71,7 +71,7 @@ def measure_guesses(
     )
 
 
-def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
+def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[SweepTask]:
     """Return the sweep of the scene as it is, and of each parameter lower and higher.
 
     Raises:
@@ -89,16 +89,16 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[Task]:
                 name,
                 f"must be a non-zero parameter of the scene, such as {known}",
             )
-    settings = (Setting(), *lower_and_higher(guesses))
+    settings = (ParameterSetting(), *lower_and_higher(guesses))
     tasks = [
-        Task(setting.name, work.key(setting), partial(measure_setting, work, setting, scenes))
+        SweepTask(setting.name, work.key(setting), partial(measure_setting, work, setting, scenes))
         for setting in settings
     ]
     return task_sweep(tasks, work.results)
 
 
 def measure_setting(
-    work: StudySensitivity, setting: Setting, scenes: Mapping[str, MockSettings]
+    work: StudySensitivity, setting: ParameterSetting, scenes: Mapping[str, MockSettings]
 ) -> SettingScores:
     """Take, label and score the trials at one setting, and delete them.
 

@@ -9,17 +9,17 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.guesses.document import SensitivityResults
-from benchmarks.guesses.plot import Changed, ChangePanel, lowered_and_raised
+from benchmarks.guesses.plot import ChangePanel, FigureChange, lowered_and_raised
 from benchmarks.guesses.results import FIGURES, UNITS, changes, figure_cells, figures
 from benchmarks.scene_parameters import AS_IT_IS, NAMES
-from sliplab.analysis.report.page import Figure, Table, number, percent
+from sliplab.analysis.report.page import PageFigure, Table, number, percent
 from sliplab.analysis.study import Finding, Study
 from sliplab.flows.cli.common import CampaignOption, StoreArgument, opened_campaigns
 
 GUESSES = tuple(NAMES)
 """Assumed parameters that are varied by default."""
 DRAWN = ("strict", "incipient_ms", "gravity_lead_ms", "disturbance_lead_ms")
-Side = Mapping[str, Mapping[str, Changed]]
+Side = Mapping[str, Mapping[str, FigureChange]]
 """Changes by figure and parameter."""
 
 
@@ -60,8 +60,8 @@ def view(found: SensitivityResults) -> dict[str, Any]:
     settings = dict(found.settings)
     base = settings.pop(AS_IT_IS)
     unchanged = figures(base)
-    lower: dict[str, dict[str, Changed]] = {key: {} for key in FIGURES}
-    higher: dict[str, dict[str, Changed]] = {key: {} for key in FIGURES}
+    lower: dict[str, dict[str, FigureChange]] = {key: {} for key in FIGURES}
+    higher: dict[str, dict[str, FigureChange]] = {key: {} for key in FIGURES}
     names: dict[str, None] = {}
     for setting in settings.values():
         parameter = setting.parameter or ""
@@ -99,7 +99,7 @@ def view(found: SensitivityResults) -> dict[str, Any]:
     return {
         "percent_changed": share,
         "trials": len(base.trials),
-        "figures": Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
+        "figures": PageFigure(svg, name="guesses", data=_data(list(names), lower, higher)),
         "settings": Table(
             ("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())), [first, *rows]
         ),
@@ -116,13 +116,13 @@ def _change_unit(key: str) -> str:
 
 def _changed(
     key: str, base: float | None, value: float | None, span: tuple[float, float] | None
-) -> Changed:
+) -> FigureChange:
     scale = _scale(key)
     change = None if base is None or value is None else scale * (value - base)
-    return Changed(change, None if span is None else (scale * span[0], scale * span[1]))
+    return FigureChange(change, None if span is None else (scale * span[0], scale * span[1]))
 
 
-def _at(key: str, base: float | None, found: Changed | None) -> str:
+def _at(key: str, base: float | None, found: FigureChange | None) -> str:
     """Return a changed figure as text."""
     if found is None or found.change is None or base is None:
         return _value(key, None, unit=False)
@@ -143,7 +143,7 @@ def _data(names: Sequence[str], lower: Side, higher: Side) -> dict[str, list[obj
             data["guess"].append(name)
             data["factor"].append(word)
             for key in FIGURES:
-                found = side[key].get(name, Changed(None, None))
+                found = side[key].get(name, FigureChange(None, None))
                 unit = _change_unit(key)
                 low, high = found.span or (None, None)
                 for heading, value in (

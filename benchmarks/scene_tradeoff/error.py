@@ -16,7 +16,7 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.samples import consecutive_windows
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.flows.scene_runs import Onsets, Seen
+from sliplab.flows.scene_runs import Onsets, SceneRun
 from sliplab.protocols.settings import Windows
 from sliplab.storage.streams import EventChunk
 
@@ -108,7 +108,7 @@ def flipped_share(begin_us: int, end_us: int, windows: Windows, a: Onsets, b: On
     return float(other.mean())
 
 
-def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
+def tensor_l1(reference: SceneRun, other: SceneRun, windows: Windows) -> float | None:
     """Return the L1 distance of all consecutive samples over the sum of the reference's.
 
     Both are cut into windows that begin with the reference's recording. None without samples.
@@ -128,7 +128,7 @@ def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
     )
 
 
-def compare(reference: Seen, other: Seen, windows: Windows) -> SceneError:
+def compare(reference: SceneRun, other: SceneRun, windows: Windows) -> SceneError:
     """Return the difference of two runs of one program."""
     median = p95 = early = unmatched = None
     if reference.events is not None and other.events is not None:
@@ -156,7 +156,7 @@ def compare(reference: Seen, other: Seen, windows: Windows) -> SceneError:
     )
 
 
-def _gross_ns(seen: Seen) -> int:
+def _gross_ns(seen: SceneRun) -> int:
     onset = seen.slips[1] if seen.markers is None else seen.markers[1]
     return seen.end_us * 1000 if onset is None else onset
 

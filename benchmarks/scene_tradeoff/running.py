@@ -11,13 +11,13 @@ import numpy as np
 
 from benchmarks.scene_tradeoff.variants import (
     ClosedForm,
-    Compared,
     Families,
     Variant,
+    VariantComparison,
     compare_variants,
     variants,
 )
-from sliplab.flows.scene_runs import Seen, changed, ideal, run, timed
+from sliplab.flows.scene_runs import SceneRun, changed, ideal, run, timed
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
@@ -67,7 +67,7 @@ class VariantJob:
     families: Families
 
 
-def compare_trial(job: VariantJob, advance: Callable[[], None] | None = None) -> Compared:
+def compare_trial(job: VariantJob, advance: Callable[[], None] | None = None) -> VariantComparison:
     """Run every variant of a trial once and compare it with the reference.
 
     What two runs differ by is the same on any machine, so this may go to a Dask cluster.
@@ -76,7 +76,7 @@ def compare_trial(job: VariantJob, advance: Callable[[], None] | None = None) ->
         advance: called after each run.
     """
 
-    def seen(variant: Variant) -> Seen:
+    def seen(variant: Variant) -> SceneRun:
         rig, seed = ideal(changed(job.rig, variant.change)), variant.seed(job.trial)
         found = run(rig, job.plan, job.trial, seed)
         if advance is not None:

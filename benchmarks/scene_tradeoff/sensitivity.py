@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import scene_parameters as assumed
-from benchmarks.scene_parameters import Outcome
+from benchmarks.scene_parameters import SceneOutcome
 from benchmarks.scene_tradeoff.variants import Variant
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.flows.scene_runs import Seen, changed, run, with_true_times
+from sliplab.flows.scene_runs import SceneRun, changed, run, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.levels import HIGHEST, slides_of, with_level
@@ -49,10 +49,10 @@ class OutcomeJob:
     plan: Plan
     trials: Sequence[Trial]
     other_seed: bool = False
-    known: Outcome | None = None
+    known: SceneOutcome | None = None
 
 
-def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Outcome:
+def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> SceneOutcome:
     """Return onsets by contact alone, and event rates of whole runs of the first trials.
 
     Args:
@@ -60,7 +60,7 @@ def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Outco
     """
     rig, plan, analysis = job.rig, job.plan, job.plan.protocol.analysis
     variant = Variant(HIGHEST, rig.scene.scene.step_ms, other_seed=job.other_seed)
-    seen: list[Seen] = []
+    seen: list[SceneRun] = []
     counted: list[SceneWindows] = []
     for trial in job.trials[:EVENT_TRIALS]:
         seen.append(run(with_true_times(rig), plan, trial, variant.seed(trial)))
@@ -69,12 +69,12 @@ def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Outco
             advance()
     rates = pooled(counted)["events_per_s"]
     if job.known is not None:
-        return Outcome(job.known.onsets_s, rates)
+        return SceneOutcome(job.known.onsets_s, rates)
     onsets = [_slide_onsets(rig.scene, plan, t, variant.seed(t)) for t in job.trials]
     slides = [onset for onset in onsets if onset is not None]
     # a falling plate has no contact-only run: its whole runs are taken
     known = slides or [_seen_onsets(item) for item in seen]
-    return Outcome(np.array(known, np.float64).reshape(-1, 2), rates)
+    return SceneOutcome(np.array(known, np.float64).reshape(-1, 2), rates)
 
 
 def _slide_onsets(
@@ -103,7 +103,7 @@ def _slide_onsets(
     return first, float(slipped[0]) - first
 
 
-def _seen_onsets(seen: Seen) -> tuple[float, float]:
+def _seen_onsets(seen: SceneRun) -> tuple[float, float]:
     first, centre = (math.nan if slip is None else slip * 1e-9 for slip in seen.slips)
     return first, centre - first
 
@@ -122,7 +122,7 @@ def measure_sensitivity(
     base = outcome(OutcomeJob(rig, plan, trials), advance)
     names = assumed.CONTACT + assumed.CAMERA
     values = {name: assumed.value_of(rig.scene, name) for name in names}
-    other_seed = assumed.Setting()
+    other_seed = assumed.ParameterSetting()
     jobs = {other_seed: OutcomeJob(rig, plan, trials, other_seed=True)}
     # without a rigid base, or something else that is switched off
     for setting in assumed.lower_and_higher([name for name, value in values.items() if value]):

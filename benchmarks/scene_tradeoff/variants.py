@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from benchmarks.scene_tradeoff.error import SceneError, choose_by_windows, compare, mean_error
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
-from sliplab.flows.scene_runs import Onsets, Seen
+from sliplab.flows.scene_runs import Onsets, SceneRun
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Windows
@@ -69,7 +69,7 @@ def variants(families: Families) -> list[Variant]:
 
 
 @dataclass(frozen=True)
-class Compared:
+class VariantComparison:
     """Comparisons of the variants of one trial.
 
     Attributes:
@@ -82,12 +82,12 @@ class Compared:
     gaps: dict[int, SceneError]
     seed: SceneError
     windows: SceneWindows
-    onsets: Seen
+    onsets: SceneRun
 
 
 def compare_variants(
-    run: Callable[[Variant], Seen], families: Families, settings: AnalysisSettings, seed: int
-) -> Compared:
+    run: Callable[[Variant], SceneRun], families: Families, settings: AnalysisSettings, seed: int
+) -> VariantComparison:
     """Run every variant of a trial once and compare it with the reference.
 
     Args:
@@ -97,7 +97,7 @@ def compare_variants(
     seen = {variant: run(variant) for variant in compared}
     reference, windows = seen[REFERENCE], settings.windows
     levels = [seen[variant] for variant in families["levels"].values()]
-    return Compared(
+    return VariantComparison(
         {item: compare(reference, seen[item], windows) for item in variants(families)},
         {k: compare(levels[k], levels[k - 1], windows) for k in range(1, HIGHEST)},
         compare(reference, seen[OTHER_SEED], windows),
@@ -132,7 +132,7 @@ class VariantRow:
 def scene_numbers(
     families: Families,
     wall_s: Sequence[Mapping[Variant, float]],
-    compared: Sequence[Compared],
+    compared: Sequence[VariantComparison],
     closed: Sequence[ClosedForm | None],
     windows: Windows,
     planned: Mapping[str, str],

@@ -17,8 +17,8 @@ import numpy as np
 from sliplab.analysis.metrics.classification import CLASSES, NO_SLIP
 from sliplab.analysis.windows.samples import choose_windows
 from sliplab.analysis.windows.windows import window_totals
-from sliplab.flows.scene_runs import Seen
-from sliplab.protocols.settings import Samples, Windows
+from sliplab.flows.scene_runs import SceneRun
+from sliplab.protocols.settings import SampleSettings, Windows
 
 PHASES = ("hold", "loading", "incipient", "gross")
 
@@ -39,7 +39,7 @@ class SceneWindows:
     """Events of the selected polarity inside the crop, by phase."""
 
 
-def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWindows:
+def look(seen: SceneRun, windows: Windows, samples: SampleSettings, seed: int) -> SceneWindows:
     """Count the samples and events of one run.
 
     Hold ends with the start of the motion, loading with the incipient onset and incipient slip
@@ -75,7 +75,7 @@ def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWind
     )
 
 
-def _selected(seen: Seen, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _selected(seen: SceneRun, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Mask of events that have the selected polarity and lie in the centred crop, (n,)."""
     assert seen.events is not None
     kept = np.ones(len(seen.events), np.bool_)

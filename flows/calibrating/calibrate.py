@@ -1,7 +1,7 @@
 """`sliplab calibrate`: lens and scale of the outside camera, the event camera's crop, the board.
 
-Each measurement returns a `Finding`, or raises and nothing is written. The ChArUco board is printed
-as a PDF of lines at true size, or as a PNG that states its resolution.
+Each measurement returns a `MeasurementResult`, or raises and nothing is written. The ChArUco board
+is printed as a PDF of lines at true size, or as a PNG that states its resolution.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, px
+from sliplab.flows.calibrating.measurement import CalibrationSession, MeasurementResult, px
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.core.capabilities import RigError
@@ -79,7 +79,9 @@ def read_pictures(folder: Path) -> list[npt.NDArray[np.uint8]]:
     return pictures
 
 
-def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today: date) -> Finding:
+def calibrate_lens(
+    pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today: date
+) -> MeasurementResult:
     """Fit the lens, and the scale on the plane of the first picture's board.
 
     Raises:
@@ -139,10 +141,12 @@ def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today:
         "focal_doubt_percent": 100 * fit.focal_doubt,
     }
     changes = {"calibration.lens": entry, "frame_camera.scale_px_per_mm": scale}
-    return Finding(changes, figures)
+    return MeasurementResult(changes, figures)
 
 
-def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: float) -> Finding:
+def calibrate_crop(
+    session: CalibrationSession, depth_mm: float, radius_mm: float
+) -> MeasurementResult:
     """Find the skin in the event camera's image.
 
     Raises:
@@ -179,7 +183,7 @@ def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: floa
         "off_the_middle_px": float(np.hypot(*(np.array(crop.centre_px) - middle))),
         "residual_px": crop.residual_px,
     }
-    return Finding({"calibration.event_crop": entry}, figures)
+    return MeasurementResult({"calibration.event_crop": entry}, figures)
 
 
 PNG_PX_PER_MM = 50

@@ -29,7 +29,7 @@ ANNOUNCEMENT = (
 
 
 @dataclass(frozen=True)
-class Finding:
+class MeasurementResult:
     """The result of a measurement: keys of the rig file to set and to remove, and figures."""
 
     changes: Mapping[str, object]
@@ -105,7 +105,7 @@ class Measurement:
         moves: Sequence[PlannedMove],
         yes: bool,
         dry_run: bool,
-        measure: Callable[[CalibrationSession], Finding],
+        measure: Callable[[CalibrationSession], MeasurementResult],
         who: str = "",
         *,
         with_arm: bool = True,
@@ -202,7 +202,7 @@ class Measurement:
         console.print_table(title, columns, table)
         console.say(who or ANNOUNCEMENT)
 
-    def _report(self, finding: Finding, path: Path, kept: Path | None) -> None:
+    def _report(self, finding: MeasurementResult, path: Path, kept: Path | None) -> None:
         removed = [key for key in finding.remove if self._had(key)]
         if self.as_json:
             console.print_json(

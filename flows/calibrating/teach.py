@@ -1,7 +1,7 @@
 """`sliplab teach`: contact plane, depth zero and tool centre point.
 
-Each measurement returns a `Finding`, or raises and nothing is written. A residual that is too large
-is a failure like any other.
+Each measurement returns a `MeasurementResult`, or raises and nothing is written. A residual that is
+too large is a failure like any other.
 """
 
 from __future__ import annotations
@@ -11,7 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, PlannedMove, mm
+from sliplab.flows.calibrating.measurement import (
+    CalibrationSession,
+    MeasurementResult,
+    PlannedMove,
+    mm,
+)
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
@@ -77,7 +82,9 @@ def check_touches(file: RigFile, name: str, span_mm: float, creep: Creep) -> Non
         raise InputError("--span", "", f"{span_mm:g} mm", "must be at least 5 mm")
 
 
-def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repeats: int) -> Finding:
+def teach_plane(
+    session: CalibrationSession, span_mm: float, creep: Creep, repeats: int
+) -> MeasurementResult:
     """Find the contact plane from three touches, and check it by a fourth.
 
     Raises:
@@ -103,7 +110,7 @@ def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repea
     return _plane_found(session, points, scatter, method, depths)
 
 
-def teach_plane_by_hand(session: CalibrationSession) -> Finding:
+def teach_plane_by_hand(session: CalibrationSession) -> MeasurementResult:
     """Find the contact plane from four points to which a person jogs the arm.
 
     Raises:
@@ -132,7 +139,7 @@ def _plane_found(
     scatter_mm: float,
     method: str,
     depths: dict[str, list[float]] | None,
-) -> Finding:
+) -> MeasurementResult:
     try:
         frame = PlateFrame.taught([points[name] for name in ("centre", "right", "above")])
     except ValueError as error:
@@ -166,7 +173,9 @@ def _plane_found(
     if depths is not None:
         figures["depths_mm"] = depths
     # a depth zero was measured from the plane that was there
-    return Finding({"calibration.contact_plane": entry}, figures, ("calibration.depth_zero",))
+    return MeasurementResult(
+        {"calibration.contact_plane": entry}, figures, ("calibration.depth_zero",)
+    )
 
 
 def marker_finder(session: CalibrationSession) -> MarkerFinder:
@@ -186,7 +195,7 @@ def marker_finder(session: CalibrationSession) -> MarkerFinder:
 
 def teach_zero(
     session: CalibrationSession, creep: Creep, repeats: int, with_markers: bool
-) -> Finding:
+) -> MeasurementResult:
     """Find depth zero at the plate's centre, by event rate and by the markers' motion.
 
     Raises:
@@ -231,10 +240,10 @@ def teach_zero(
             )
     entry |= {"taught": session.today, "residual": mm(residual), "method": method}
     figures["residual_mm"] = residual
-    return Finding({"calibration.depth_zero": entry}, figures)
+    return MeasurementResult({"calibration.depth_zero": entry}, figures)
 
 
-def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
+def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> MeasurementResult:
     """Find the tool centre point: a person brings the tip onto one point, leaning differently.
 
     Args:
@@ -288,4 +297,4 @@ def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
         "errors_mm": pivot.errors_mm.tolist(),
         "spread": pivot.spread,
     }
-    return Finding({"calibration.tool_centre_point": entry}, figures)
+    return MeasurementResult({"calibration.tool_centre_point": entry}, figures)

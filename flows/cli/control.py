@@ -18,7 +18,7 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 
 if TYPE_CHECKING:
-    from sliplab.flows.collecting.requests import Outcome
+    from sliplab.flows.collecting.requests import RequestOutcome
     from sliplab.storage.trials.control import Kind
 
 app = typer.Typer()
@@ -129,7 +129,7 @@ def again(
     _decide(store, "again", trials, campaign, who, why, wait, as_json)
 
 
-def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcome:
+def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> RequestOutcome:
     from sliplab.flows.collecting import requests
     from sliplab.storage.trials.store import Store
 
@@ -167,7 +167,7 @@ def _decide(
     _finish(outcomes, as_json, "\n".join(lines))
 
 
-def _pause_words(store: Path, outcome: Outcome) -> str:
+def _pause_words(store: Path, outcome: RequestOutcome) -> str:
     did = {} if outcome.answer is None else outcome.answer["did"]
     if did.get("running"):
         return f"{store} is paused, between two trials; continue with `sliplab resume {store}`"
@@ -176,7 +176,7 @@ def _pause_words(store: Path, outcome: Outcome) -> str:
     )
 
 
-def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
+def _finish(outcomes: list[RequestOutcome], as_json: bool, words: str) -> None:
     """Print the outcomes; exit 1 if a request is still open."""
     done = all(outcome.answer is not None for outcome in outcomes)
     if as_json:

@@ -13,7 +13,7 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplab.flows.calibrating.measurement import CalibrationSession, Finding
+    from sliplab.flows.calibrating.measurement import CalibrationSession, MeasurementResult
     from sliplab.rigs.core.teaching import Creep
     from sliplab.rigs.rig_file import RigFile
 
@@ -363,7 +363,7 @@ def calibrate_lens(
     board = _board(columns, rows, square)
     command = Measurement(rig, out, "lens", as_json)
 
-    def measure(session: CalibrationSession) -> Finding:
+    def measure(session: CalibrationSession) -> MeasurementResult:
         if images is not None:
             pictures = steps.read_pictures(images)
         else:

@@ -86,7 +86,7 @@ class Remaining:
         return "" if seconds is None else f"{console.duration(max(seconds, 0.0))} left"
 
 
-class Progress:
+class CollectionProgress:
     """Progress of one collection: trials by outcome, and the time left.
 
     It is shown as a bar on the console, and read by the thread that reports to Prefect's page.
@@ -100,7 +100,7 @@ class Progress:
         self._total = self._done = 0
         self.outcomes: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._bar: console.Bar
+        self._bar: console.ProgressBar
         self._left: Remaining
 
     @contextmanager
@@ -150,13 +150,13 @@ class Progress:
 
 
 @contextmanager
-def shown(run_request: RunRequest) -> Iterator[Progress]:
+def shown(run_request: RunRequest) -> Iterator[CollectionProgress]:
     """Yield the progress of a collection, and report it to the page of the flow run around it."""
     from prefect.context import FlowRunContext
 
     context = FlowRunContext.get()
     if context is None or context.flow_run is None:
-        yield Progress(run_request, lambda: None)
+        yield CollectionProgress(run_request, lambda: None)
         return
     page = _Page(run_request, context.flow_run.id)
     try:
@@ -178,7 +178,7 @@ class _Page:
         self._thread = threading.Thread(
             target=settings.run, args=(self._report_until_end,), name="page", daemon=True
         )
-        self.progress = Progress(run_request, self._thread.start)
+        self.progress = CollectionProgress(run_request, self._thread.start)
 
     def end(self) -> None:
         """Send the last report; wait for it, up to a limit."""

@@ -24,7 +24,7 @@ from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.control import Kind, Request
+from sliplab.storage.trials.control import ControlRequest, Kind
 from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
 from sliplab.storage.trials.migrate import migrate
 from sliplab.storage.trials.store import Store
@@ -58,7 +58,7 @@ def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iter
 
 
 @uninterrupted
-def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]:
+def carry_out(store: Store, running: bool = False) -> list[tuple[ControlRequest, Json]]:
     """Carry out all open requests; the caller holds the store's lock.
 
     Args:
@@ -123,7 +123,7 @@ def halt(folder: Path) -> tuple[Json | None, bool]:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RequestOutcome:
     """The outcome of a request.
 
     Attributes:
@@ -131,7 +131,7 @@ class Outcome:
         holder: the program that held the store when the request was made, if any.
     """
 
-    request: Request
+    request: ControlRequest
     answer: Json | None
     holder: Json | None
 
@@ -159,7 +159,7 @@ def ask(
     campaign: str = "",
     trials: tuple[str, ...] = (),
     limit_s: float = 600.0,
-) -> Outcome:
+) -> RequestOutcome:
     """Make a request, and wait until a running collection or this program has carried it out.
 
     Args:
@@ -169,12 +169,12 @@ def ask(
     holder = _carry_out_if_free(store)
     if control.answered(store, made) is None and limit_s > 0:
         _wait(store, "waiting for the current trial to end (s)", limit_s, made)
-    return Outcome(made, control.answered(store, made), holder)
+    return RequestOutcome(made, control.answered(store, made), holder)
 
 
 def stop_collection(
     store: Store, *, who: str = "", why: str = "", limit_s: float = 60.0
-) -> Outcome:
+) -> RequestOutcome:
     """Stop the collection that runs on the store, the arm first, and wait until it has ended.
 
     The signal goes out before anything is written. A collection that no signal reaches from here,
@@ -191,7 +191,7 @@ def note_stop(
     who: str = "",
     why: str = "",
     limit_s: float = 60.0,
-) -> Outcome:
+) -> RequestOutcome:
     """Record a stop whose signal `halt` has sent, and wait until the collection has ended."""
     if holder is not None and not holder.get("collects"):
         console.say(f"{process.named(holder)}: is not collecting and was not signalled")
@@ -210,7 +210,7 @@ def note_stop(
     if holder is not None and (left is None or left.get("pid") != holder["pid"]):
         control.answer(store, made, {"stopped": True, "running": True})
     _carry_out_if_free(store)
-    return Outcome(made, control.answered(store, made), holder)
+    return RequestOutcome(made, control.answered(store, made), holder)
 
 
 def known_trials(
@@ -256,7 +256,7 @@ def _carry_out_if_free(store: Store) -> Json | None:
     return None
 
 
-def _wait(store: Store, title: str, limit_s: float, made: Request | None) -> None:
+def _wait(store: Store, title: str, limit_s: float, made: ControlRequest | None) -> None:
     """Wait until the request is answered or the store's lock is free; `limit_s` at most.
 
     Raises:

@@ -39,11 +39,11 @@ from sliplab.storage.files import sha256, sweep_temporary
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.trial import (
     Geometry,
+    MotionStep,
     Provenance,
-    Quality,
     RecordedTiming,
-    Step,
     StreamRecord,
+    TrialQuality,
     TrialRecord,
 )
 from sliplab.storage.streams import Json
@@ -451,9 +451,11 @@ class TrialCollector:
                 rate_hz=self.plan.protocol.collection.recording.sync_rate,
                 mid_exposure_ns=self.rig.frames.mid_exposure_ns if frame_px else None,
             ),
-            quality=Quality(passed=found.passed, gates=found.gates),
+            quality=TrialQuality(passed=found.passed, gates=found.gates),
             steps=tuple(
-                Step(phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=kept)
+                MotionStep(
+                    phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=kept
+                )
                 for step, kept in run.steps
             ),
             geometry=self._geometry(frame_px),

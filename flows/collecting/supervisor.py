@@ -15,7 +15,7 @@ from sliplab.flows.running import console, stopping
 from sliplab.protocols import Trial
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.control import Request
+from sliplab.storage.trials.control import ControlRequest
 from sliplab.storage.trials.store import Campaign, Store
 
 PAUSE_LIMIT_S = 12 * 3600.0
@@ -54,7 +54,7 @@ class CollectionSupervisor:
         self.on_pause = on_pause
         self.clock: Callable[[], float] = time.time
         self._seen: frozenset[str] = frozenset()
-        self._paused: Request | None = None
+        self._paused: ControlRequest | None = None
         self._was_paused = False
         self._skipped = frozenset(control.skipped(campaign))
         self._retakes: set[str] = set()
@@ -108,7 +108,7 @@ class CollectionSupervisor:
             t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in retakes
         ]
 
-    def _process_requests(self) -> Request | None:
+    def _process_requests(self) -> ControlRequest | None:
         """Carry out new requests; return the one by which the store is paused, if it is."""
         names = self._names()
         if names != self._seen:
@@ -118,7 +118,7 @@ class CollectionSupervisor:
             self._paused = control.paused(self._store)
         return self._paused
 
-    def _apply(self, request: Request, answer: Json) -> None:
+    def _apply(self, request: ControlRequest, answer: Json) -> None:
         """Apply an answered request to this session."""
         if request.kind == "stop":
             console.say(f"stopped: {request}")

@@ -18,16 +18,16 @@ import numpy as np
 from sliplab.analysis.detectors.live import (
     UNDECIDED,
     ClockFellBack,
-    Decision,
     DecisionJson,
     FreshestArrival,
+    LiveDecision,
     LiveDetector,
     TimedDecision,
 )
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
 from sliplab.flows.detecting.network_process import NetworkLost
 from sliplab.rigs.core.capabilities import Clock
-from sliplab.rigs.core.reacting import Evidence, SenseLost, SlipDetected
+from sliplab.rigs.core.reacting import DetectionTimes, SenseLost, SlipDetected
 from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
 
 PATIENCE_US = 200_000
@@ -171,7 +171,7 @@ class DetectSink(NullSink):
         if self._timeouts is None or here_ns - soonest_ns <= self._timeouts.stream_ns:
             self._alive_ns = here_ns
 
-    def _decided(self, work: Callable[[], list[Decision]]) -> list[Decision]:
+    def _decided(self, work: Callable[[], list[LiveDecision]]) -> list[LiveDecision]:
         """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""
         try:
             return work()
@@ -181,8 +181,8 @@ class DetectSink(NullSink):
             device = "event camera" if isinstance(error, ClockFellBack) else "network"
             raise SenseLost(f"{device}: {error}") from error
 
-    def _report(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
-        slip: Evidence | None = None
+    def _report(self, made: list[LiveDecision], here_ns: int, began_ns: int) -> None:
+        slip: DetectionTimes | None = None
         late_ns = self._clock.now_ns() - here_ns if made else 0
         most_ns = None if self._timeouts is None else self._timeouts.decision_ns
         if self.guarded and most_ns is not None and late_ns > most_ns:
@@ -215,12 +215,12 @@ class DetectSink(NullSink):
             self.armed = False
             raise SlipDetected(slip)
 
-    def _evidence(self, decision: Decision, here_ns: int, compute_ms: float) -> Evidence:
+    def _evidence(self, decision: LiveDecision, here_ns: int, compute_ms: float) -> DetectionTimes:
         ended_ns = self._camera.host_ns(decision.end_us)
         assert ended_ns is not None
         origin_us = self.detector.origin_us
         assert origin_us is not None
-        return Evidence(
+        return DetectionTimes(
             (decision.end_us - origin_us) / 1e6,
             self.detector.span_us / 1e3,
             (here_ns - ended_ns) / 1e6,

@@ -11,7 +11,7 @@ from sliplab.protocols import Plan
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from sliplab.rigs.levels import Choice, SlipExpected
+    from sliplab.rigs.levels import LevelChoice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
     from sliplab.storage.streams import Json
 
@@ -20,7 +20,7 @@ MOST_STRETCHES = 8
 
 
 class SceneJson(TypedDict):
-    """`Scene` as part of a plan's JSON."""
+    """`PlannedScene` as part of a plan's JSON."""
 
     level: str
     reason: str
@@ -87,14 +87,14 @@ class Forecast:
 
 
 @dataclass(frozen=True)
-class Scene:
+class PlannedScene:
     """A simulated rig's level of physics for a plan, and the slip to expect.
 
     Attributes:
         expected: see `rigs.levels.slip_expected`.
     """
 
-    choice: Choice
+    choice: LevelChoice
     expected: SlipExpected | None
 
     def as_json(self) -> SceneJson:
@@ -117,16 +117,16 @@ class Scene:
         return pairs
 
 
-def scene_of(rig: RigFile, plan: Plan) -> Scene | None:
+def scene_of(rig: RigFile, plan: Plan) -> PlannedScene | None:
     """Return the scene of a plan, None on a real rig."""
     from sliplab.rigs.levels import choose_level, slip_expected
 
     choice = choose_level(rig, plan)
-    return None if choice is None else Scene(choice, slip_expected(rig, plan))
+    return None if choice is None else PlannedScene(choice, slip_expected(rig, plan))
 
 
 def plan_json(
-    found: Plan, needed: int | None, scene: Scene | None, claims: Forecast | None
+    found: Plan, needed: int | None, scene: PlannedScene | None, claims: Forecast | None
 ) -> PlanJson:
     """Return the plan as one JSON object.
 
@@ -191,7 +191,7 @@ def _claims(found: Plan) -> Iterator[str]:
 
 
 def print_plan(
-    found: Plan, needed: int | None, scene: Scene | None, claims: Forecast | None
+    found: Plan, needed: int | None, scene: PlannedScene | None, claims: Forecast | None
 ) -> None:
     """Print the plan as tables; arguments as of `plan_json`."""
     factors = list(found.protocol.collection.all_factors)

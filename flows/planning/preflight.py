@@ -36,7 +36,7 @@ LISTEN_S = 3.0
 
 
 @dataclass(frozen=True)
-class Check:
+class PreflightCheck:
     """One check and its finding.
 
     Attributes:
@@ -49,7 +49,7 @@ class Check:
     caution: bool = False
 
 
-def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:
+def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[PreflightCheck]:
     """Check protocol, rig file, space, calibration, devices and clocks; nothing moves.
 
     Raises:
@@ -58,34 +58,38 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     run_request = make_request(protocol, rig, store, enable=enable)
     pending = pending_trials(run_request.plan, Store(store).campaign(run_request.campaign))
     found = [
-        Check(
+        PreflightCheck(
             "protocol and limits",
             True,
             f"{plural(len(run_request.plan), 'trial')} within all limits",
         ),
-        Check("campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"),
+        PreflightCheck(
+            "campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"
+        ),
     ]
-    found.append(Check("outside camera", True, _outside_camera(run_request)))
+    found.append(PreflightCheck("outside camera", True, _outside_camera(run_request)))
     found += check_region(run_request)
-    found += [Check("hint", True, text, True) for text in run_request.plan.warnings()]
+    found += [PreflightCheck("hint", True, text, True) for text in run_request.plan.warnings()]
     if (twin := run_request.rig.twin) is not None:
         cautions = list(warnings(twin, run_request.plan))
         within = (
             f"within what it was fitted on: {plural(twin.trials, 'trial')} of '{twin.campaign}'"
         )
-        found += [Check("twin", True, text, bool(cautions)) for text in cautions or [within]]
+        found += [
+            PreflightCheck("twin", True, text, bool(cautions)) for text in cautions or [within]
+        ]
     try:
         free = check_disk([run_request])
         needed = size(missing_bytes(run_request))
-        found.append(Check("space", True, f"needs {needed}, {size(free)} free"))
+        found.append(PreflightCheck("space", True, f"needs {needed}, {size(free)} free"))
     except InputError as error:
-        found.append(Check("space", False, error.expected))
+        found.append(PreflightCheck("space", False, error.expected))
     found += _check_calibration(run_request, rig)
     found += check_devices(run_request)
     return found
 
 
-def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
+def _check_calibration(run_request: RunRequest, rig: Path) -> list[PreflightCheck]:
     """Check that the measurements of the rig exist, are recent, and are consistent."""
     plan, calibration = run_request.plan.protocol.collection, run_request.rig.calibration
     needed = {"contact_plane", "tool_centre_point", "event_crop"}
@@ -102,7 +106,7 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
     )
     source = read_rig(rig_path(rig))
     found = [
-        Check(
+        PreflightCheck(
             "calibration",
             False,
             InputError(
@@ -118,7 +122,7 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
         entries = [name for name in COMMANDS if getattr(calibration, name) is not None]
         days = ", ".join(f"{name} {measured_on(calibration, name)}" for name in entries)
         age = " (simulated: any age)" if run_request.rig.simulated else ""
-        found.append(Check("calibration", True, f"{days}{age}"))
+        found.append(PreflightCheck("calibration", True, f"{days}{age}"))
     return found
 
 
@@ -133,7 +137,7 @@ def _outside_camera(run_request: RunRequest) -> str:
     return f"{simulated}video, {frame_px[0]} x {frame_px[1]} px"
 
 
-def check_region(run_request: RunRequest) -> list[Check]:
+def check_region(run_request: RunRequest) -> list[PreflightCheck]:
     """Check that the recorded region covers the markers on all motions; no check without video.
 
     The centre marker must stay in it, since gross slip is read from it. Outer markers may leave:
@@ -154,11 +158,11 @@ def check_region(run_request: RunRequest) -> list[Check]:
             f"{max(reach):.1f} mm from the middle and has a radius of {radius:g} mm; widen "
             f"recording.region by {-2 * spare:.1f} mm"
         )
-        return [Check("region", False, text)]
+        return [PreflightCheck("region", False, text)]
     text = f"covers the centre marker's whole path, with {spare:.1f} mm to spare"
     if spare < skin:
         text += f"; markers more than {spare:.1f} mm from the centre leave it on the longest"
-    return [Check("region", True, text)]
+    return [PreflightCheck("region", True, text)]
 
 
 def _reach(run_request: RunRequest) -> tuple[float, float]:
@@ -171,7 +175,7 @@ def _reach(run_request: RunRequest) -> tuple[float, float]:
     return x, y
 
 
-def check_devices(run_request: RunRequest) -> list[Check]:
+def check_devices(run_request: RunRequest) -> list[PreflightCheck]:
     """Connect every device, read its state, and fit the clocks; nothing moves."""
     from sliplab.rigs.rig_lock import held
 
@@ -179,12 +183,12 @@ def check_devices(run_request: RunRequest) -> list[Check]:
         with held(run_request.rig, run_request.store):
             return _check_held(run_request)
     except Locked as error:
-        return [Check("rig", False, str(error))]
+        return [PreflightCheck("rig", False, str(error))]
     except RigError as error:
-        return [Check(error.device, False, _message(error))]
+        return [PreflightCheck(error.device, False, _message(error))]
 
 
-def _check_held(run_request: RunRequest) -> list[Check]:
+def _check_held(run_request: RunRequest) -> list[PreflightCheck]:
     """Check the devices of a rig whose lock is held."""
     from sliplab.rigs.build import build_rig
 
@@ -194,41 +198,43 @@ def _check_held(run_request: RunRequest) -> list[Check]:
     try:
         rig = build_rig(run_request.rig)
     except RigError as error:
-        return [Check(error.device, False, _message(error))]
+        return [PreflightCheck(error.device, False, _message(error))]
     try:
         rig.connect()
         state = rig.arm.state()
         if not state.healthy:
             raise ArmFault("arm", f"is in {state.value}: {state.advice}")
-        found.append(Check("arm", True, state.value))
-        found += [Check(device.device, True, _health_text(device)) for device in rig.health()]
+        found.append(PreflightCheck("arm", True, state.value))
+        found += [
+            PreflightCheck(device.device, True, _health_text(device)) for device in rig.health()
+        ]
         found += _check_clocks(run_request, rig)
     except RigError as error:
-        found.append(Check(error.device, False, _message(error)))
+        found.append(PreflightCheck(error.device, False, _message(error)))
     finally:
         try:
             rig.close()
         except RigError as error:  # added to what was found
-            failed = Check(error.device, False, _message(error))
+            failed = PreflightCheck(error.device, False, _message(error))
             if failed not in found:
                 found.append(failed)
     return found
 
 
-def _check_reach(run_request: RunRequest) -> list[Check]:
+def _check_reach(run_request: RunRequest) -> list[PreflightCheck]:
     """Return the devices of a real rig that cannot be reached at all, each by name."""
     if run_request.rig.simulated or run_request.rig.devices is None:
         return []
     from sliplab.rigs.discovery import ping_devices
 
     return [
-        Check(name, False, why)
+        PreflightCheck(name, False, why)
         for name, why in ping_devices(run_request.rig.devices, run_request.rig.streams).items()
         if why is not None
     ]
 
 
-def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
+def _check_clocks(run_request: RunRequest, rig: Rig) -> list[PreflightCheck]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
     from sliplab.analysis.clocks.synchronise import further_clocks, streams_of, synchronise
     from sliplab.analysis.quality import sync_gate
@@ -256,9 +262,13 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
             f"({device.grade})"
         )
         found.append(
-            Check(f"clock: {name}", gate.passed, text + _beyond_gate(gate, device, rig.timing))
+            PreflightCheck(
+                f"clock: {name}", gate.passed, text + _beyond_gate(gate, device, rig.timing)
+            )
         )
-    return found + [Check(f"clock: {name}", False, why) for name, why in fitted.refused.items()]
+    return found + [
+        PreflightCheck(f"clock: {name}", False, why) for name, why in fitted.refused.items()
+    ]
 
 
 def _beyond_gate(gate: Gate, device: DeviceSync, timing: Timing) -> str:
@@ -297,9 +307,9 @@ class Checks(TypedDict):
     """Checks as `sliplab check --json` prints them."""
 
     passed: bool
-    checks: list[Check]
+    checks: list[PreflightCheck]
 
 
-def checks_json(found: list[Check]) -> Checks:
+def checks_json(found: list[PreflightCheck]) -> Checks:
     """Return the checks as one JSON object."""
     return {"passed": all(item.passed for item in found), "checks": found}

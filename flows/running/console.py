@@ -232,7 +232,7 @@ def _clean(text: str) -> str:
     return printable(masked(text))
 
 
-class Bar:
+class ProgressBar:
     """A progress bar's handle; where there is no terminal, a line now and then."""
 
     def __init__(self, progress: Progress, task: Any) -> None:
@@ -270,7 +270,7 @@ class Bar:
 
 
 @contextmanager
-def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
+def bar(title: str, total: float, left: str | None = None) -> Iterator[ProgressBar]:
     """A progress bar on standard error while the block runs.
 
     Args:
@@ -288,7 +288,7 @@ def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
         speed_estimate_period=SPEED_OVER_S,
     )
     with progress:
-        yield Bar(
+        yield ProgressBar(
             progress, progress.add_task(printable(title), total=total, note="", left=left or "")
         )
 

@@ -28,7 +28,7 @@ class OutputLost(Exception):
     """Standard output did not take a result; the message says why."""
 
 
-class _Stream(io.RawIOBase):
+class _ByteStream(io.RawIOBase):
     """Bytes to a standard stream.
 
     Args:
@@ -117,7 +117,7 @@ def _is_open(number: int) -> bool:
 
 
 def _text(number: int, lost: str, like: TextIO | None, *, required: bool) -> TextIO:
-    raw = _Stream(number, lost, required=required)
+    raw = _ByteStream(number, lost, required=required)
     return io.TextIOWrapper(
         io.BufferedWriter(raw),
         encoding="utf-8" if like is None else like.encoding,

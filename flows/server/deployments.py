@@ -23,12 +23,12 @@ from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import die_with
 from sliplab.flows.server.schedules import (
     Ask,
-    Chain,
     Collect,
     Evaluate,
     OnRig,
-    Step,
-    Study,
+    ScheduledChain,
+    ScheduledStep,
+    ScheduledStudy,
     window_end,
 )
 from sliplab.flows.server.service import Service, service
@@ -154,7 +154,7 @@ def _words(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
-STEP, EVALUATE, STUDY, ASK = Step(), Evaluate(), Study(), Ask()
+STEP, EVALUATE, STUDY, ASK = ScheduledStep(), Evaluate(), ScheduledStudy(), Ask()
 served: Callable[..., Any] = partial(
     flow, persist_result=False, result_storage=orchestration.NO_RESULTS
 )
@@ -167,13 +167,13 @@ def collect(wanted: Collect) -> Any:
 
 
 @served(name="label")
-def label(wanted: Step = STEP) -> Any:
+def label(wanted: ScheduledStep = STEP) -> Any:
     """Find the true onsets of every trial."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "label"))
 
 
 @served(name="train")
-def train(wanted: Step = STEP) -> Any:
+def train(wanted: ScheduledStep = STEP) -> Any:
     """Train the spiking network on the labelled kinematic trials."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "train"))
 
@@ -186,19 +186,19 @@ def evaluate(wanted: Evaluate = EVALUATE) -> Any:
 
 
 @served(name="report")
-def report(wanted: Step = STEP) -> Any:
+def report(wanted: ScheduledStep = STEP) -> Any:
     """Write report/index.html and report/summary.json."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "report"))
 
 
 @served(name="study")
-def study(wanted: Study = STUDY) -> Any:
+def study(wanted: ScheduledStudy = STUDY) -> Any:
     """The whole chain: collect, sync, label, train, evaluate, report."""
     return run_of(partial(_study, wanted))
 
 
 @served(name="chain")
-def chain(wanted: Chain) -> Any:
+def chain(wanted: ScheduledChain) -> Any:
     """Collect, then label, train and evaluate what there is."""
     return run_of(partial(_chain, wanted))
 
@@ -270,7 +270,7 @@ def _collect(wanted: Collect, here: Service, run: Any) -> str:
     return _take(wanted, run_request, run)
 
 
-def _chain(wanted: Chain, here: Service, run: Any) -> str:
+def _chain(wanted: ScheduledChain, here: Service, run: Any) -> str:
     from sliplab.flows.collecting.supervisor import WindowOver
 
     try:
@@ -281,7 +281,7 @@ def _chain(wanted: Chain, here: Service, run: Any) -> str:
     return "; ".join([taken, *(_steps(here, [], name) for name in names)])
 
 
-def _study(wanted: Study, here: Service, run: Any) -> str:
+def _study(wanted: ScheduledStudy, here: Service, run: Any) -> str:
     from sliplab.flows.study import study as whole
 
     files = study_protocols(wanted.pilot, wanted.extra)

@@ -163,7 +163,7 @@ class Collect(OnRig):
     )
 
 
-class Chain(Collect):
+class ScheduledChain(Collect):
     """Collection, then labels and evaluation of what there is."""
 
     train: bool = Field(
@@ -172,7 +172,7 @@ class Chain(Collect):
     )
 
 
-class Study(OnRig):
+class ScheduledStudy(OnRig):
     """The whole chain over the shipped protocols, to the report."""
 
     pilot: bool = Field(default=False, description="Use the small pilot protocols.")
@@ -181,13 +181,13 @@ class Study(OnRig):
     )
 
 
-class Step(Parameters):
+class ScheduledStep(Parameters):
     """One step on what is stored."""
 
     campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
-class Evaluate(Step):
+class Evaluate(ScheduledStep):
     """Scores the network on trials it has never seen."""
 
     margin: float | None = Field(
@@ -214,12 +214,12 @@ class Ask(Parameters):
 FlowName = Literal["collect", "label", "train", "evaluate", "report", "study", "chain"]
 SCHEDULED: dict[FlowName, type[Parameters]] = {
     "collect": Collect,
-    "label": Step,
-    "train": Step,
+    "label": ScheduledStep,
+    "train": ScheduledStep,
     "evaluate": Evaluate,
-    "report": Step,
-    "study": Study,
-    "chain": Chain,
+    "report": ScheduledStep,
+    "study": ScheduledStudy,
+    "chain": ScheduledChain,
 }
 """Flows that a schedule may start; `pause`, `resume` and `stop` are for people."""
 
@@ -227,7 +227,7 @@ SCHEDULED: dict[FlowName, type[Parameters]] = {
 Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 
 
-class Timing(StrictModel):
+class StartTimes(StrictModel):
     """Start times of a flow: days and an hour, or a cron line."""
 
     model_config = ConfigDict(populate_by_name=True)
@@ -239,19 +239,19 @@ class Timing(StrictModel):
     active: bool = True
 
     @rule
-    def _has_a_time(self) -> Timing:
+    def _has_a_time(self) -> StartTimes:
         _cron(self)
         return self
 
 
-_TIMING = {*Timing.model_fields, "flow", "timezone"}
+_TIMING = {*StartTimes.model_fields, "flow", "timezone"}
 
 
 def _schedule(flow: FlowName, parameters: type[Parameters]) -> type[BaseModel]:
     """Timing and the parameters of one flow in one mapping, as a person writes it."""
     kind: Any = Literal[flow]
     made: type[BaseModel] = create_model(
-        f"{flow} schedule", __base__=(Timing, parameters), flow=(kind, ...)
+        f"{flow} schedule", __base__=(StartTimes, parameters), flow=(kind, ...)
     )
     return made
 

@@ -27,7 +27,7 @@ from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.review import Decision, Onsets, Verdict
+from sliplab.storage.trials.review import Decision, ReviewedOnsets, Verdict
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.video import FrameReader
 
@@ -35,7 +35,7 @@ LabelState = Literal["fresh", "stale", "missing"]
 
 
 @dataclass(frozen=True)
-class Row:
+class ReviewRow:
     """One trial in the list.
 
     Attributes:
@@ -82,7 +82,7 @@ class Row:
         return self.severity > 0
 
 
-def row_of(store: Store, item: Collected, trial: str, order: int) -> Row:
+def row_of(store: Store, item: Collected, trial: str, order: int) -> ReviewRow:
     """Return the row of one committed trial.
 
     Raises:
@@ -104,7 +104,7 @@ def row_of(store: Store, item: Collected, trial: str, order: int) -> Row:
         decision = review.last(store, item.name, trial)
     except StoreError as error:
         problem = str(error)
-    return Row(
+    return ReviewRow(
         order,
         item.name,
         trial,
@@ -128,7 +128,7 @@ class TrialList:
         self._folders: object = None
         self._ranks: Mapping[tuple[str, str], int] = {}
         self.items: dict[str, Collected] = {}
-        self.rows: list[Row] = []
+        self.rows: list[ReviewRow] = []
         self.refresh()
 
     def refresh(self) -> bool:
@@ -160,7 +160,7 @@ class TrialList:
         if not slips:
             need_slip(list(items.values()))
         items = slips
-        rows: list[Row] = []
+        rows: list[ReviewRow] = []
         for item in items.values():
             whole = item.campaign.committed()
             planned = [trial.id for trial in item.planned if trial.id in whole]
@@ -172,7 +172,7 @@ class TrialList:
         self.items, self.rows, self._folders = items, rows, folders
         return True
 
-    def renew(self, row: Row) -> Row:
+    def renew(self, row: ReviewRow) -> ReviewRow:
         """Make the row of a trial again."""
         item = self.items[row.campaign]
         fresh = self._ranked(row_of(self.store, item, row.trial, row.order))
@@ -189,7 +189,7 @@ class TrialList:
         """True if `rank` gave an order."""
         return bool(self._ranks)
 
-    def _ranked(self, row: Row) -> Row:
+    def _ranked(self, row: ReviewRow) -> ReviewRow:
         return replace(row, rank=self._ranks.get(row.name, len(self._ranks)))
 
     def _look(self) -> tuple[object, dict[str, dict[str, int]]]:
@@ -206,18 +206,18 @@ class TrialList:
         return seen, counts
 
 
-def _count(counts: dict[str, dict[str, int]], row: Row) -> int:
+def _count(counts: dict[str, dict[str, int]], row: ReviewRow) -> int:
     return counts.get(row.campaign, {}).get(row.trial, 0)
 
 
 def filtered_rows(
-    rows: Iterable[Row],
+    rows: Iterable[ReviewRow],
     *,
     campaign: str = "",
     state: str = "",
     text: str = "",
     doubtful_first: bool = True,
-) -> list[Row]:
+) -> list[ReviewRow]:
     """Return the rows that pass the filters, in the order of work.
 
     Args:
@@ -239,11 +239,11 @@ def filtered_rows(
     return found
 
 
-def _waits(row: Row) -> bool:
+def _waits(row: ReviewRow) -> bool:
     return row.state in {"open", "stale"}
 
 
-def as_columns(rows: Sequence[Row]) -> dict[str, list[str]]:
+def as_columns(rows: Sequence[ReviewRow]) -> dict[str, list[str]]:
     """Return the rows as columns of the page's table."""
     return {
         "trial": [row.trial for row in rows],
@@ -271,7 +271,7 @@ class ShownTrial:
         span_s: start and end of the recording; motion_s: of the slide or retraction.
     """
 
-    row: Row
+    row: ReviewRow
     item: Collected
     recording: Recording
     label: TrialLabel | None
@@ -306,16 +306,16 @@ class ShownTrial:
         return self.frame_ns / 1e9
 
     @property
-    def onsets(self) -> Onsets:
+    def onsets(self) -> ReviewedOnsets:
         """The label's onsets."""
         if self.label is None:
-            return Onsets()
-        return Onsets(self.label.incipient_ns, self.label.gross_ns)
+            return ReviewedOnsets()
+        return ReviewedOnsets(self.label.incipient_ns, self.label.gross_ns)
 
     @property
-    def suggested(self) -> Onsets:
+    def suggested(self) -> ReviewedOnsets:
         """Onsets by the markers that were seen, also where the label is in doubt."""
-        return Onsets() if self.label is None else suggested_onsets(self.label, self.centre)
+        return ReviewedOnsets() if self.label is None else suggested_onsets(self.label, self.centre)
 
     def frame_at(self, time_s: float) -> int:
         """Return the index of the frame nearest to a time; -1 without frames."""
@@ -342,7 +342,7 @@ class ShownTrial:
             self._reader = None
 
 
-def load_trial(store: Store, item: Collected, row: Row) -> ShownTrial:
+def load_trial(store: Store, item: Collected, row: ReviewRow) -> ShownTrial:
     """Read the displayed data of a trial; frames are read later, one at a time.
 
     Raises:
@@ -403,7 +403,12 @@ class LabelChanged(ValueError):
 
 
 def record_verdict(
-    trials: TrialList, shown: ShownTrial, verdict: Verdict, lines: Onsets, who: str, why: str
+    trials: TrialList,
+    shown: ShownTrial,
+    verdict: Verdict,
+    lines: ReviewedOnsets,
+    who: str,
+    why: str,
 ) -> Decision:
     """Store a verdict on the trial and label that are shown.
 
@@ -419,7 +424,7 @@ def record_verdict(
     now = trials.renew(shown.row)
     if now.label != "fresh" or now.key != shown.label_key:
         raise LabelChanged("the label has changed in the meantime; review it again")
-    new = {"adjust": lines, "reject": Onsets()}.get(verdict, shown.onsets)
+    new = {"adjust": lines, "reject": ReviewedOnsets()}.get(verdict, shown.onsets)
     for kind, time in vars(new).items():
         if time is not None and not shown.span_s[0] <= time / 1e9 <= shown.span_s[1]:
             name = kind.removesuffix("_ns")

@@ -14,7 +14,7 @@ from bokeh.events import DocumentReady
 
 from sliplab.flows.ui.review import (
     LabelChanged,
-    Row,
+    ReviewRow,
     ShownTrial,
     TrialList,
     as_columns,
@@ -35,12 +35,12 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import U8
 from sliplab.storage.trials import review
-from sliplab.storage.trials.review import Onsets, Verdict
+from sliplab.storage.trials.review import ReviewedOnsets, Verdict
 
 REFRESH_MS = 2000
 
 
-class Page:
+class ReviewTab:
     """One tab.
 
     Args:
@@ -54,13 +54,13 @@ class Page:
         self.trials = trials
         self._background = Background(doc, pool, self._say)
         self.shown: ShownTrial | None = None
-        self._rows: list[Row] = []
+        self._rows: list[ReviewRow] = []
         self._requested: tuple[str, str] | None = None
         self._frame: int | None = None
         self._drawing = False
         self._close_by = False
         self._looking = False
-        self._listed: list[Row] | None = None
+        self._listed: list[ReviewRow] | None = None
         self.plots = TimePlots(self._moved, self._cursor)
         self.frame = FramePlot()
         self.see = Widgets([*trials.items], who)
@@ -165,7 +165,7 @@ class Page:
 
     # one trial
 
-    def _choose(self, item: Row) -> None:
+    def _choose(self, item: ReviewRow) -> None:
         """Read a trial in the background, then show it."""
         self._requested = item.name
         self._mark()
@@ -204,7 +204,7 @@ class Page:
         except StoreError:
             return []  # the row says so
 
-    def _lines_of(self, shown: ShownTrial, decided: list[review.Decision]) -> Onsets:
+    def _lines_of(self, shown: ShownTrial, decided: list[review.Decision]) -> ReviewedOnsets:
         """Return where the lines begin: as adjusted, else as the label has or suggests them."""
         if decided and decided[-1].verdict == "adjust" and decided[-1].label == shown.row.key:
             return decided[-1].new
@@ -287,7 +287,7 @@ class Page:
         self._fill()
         self._choose(after or shown.row)
 
-    def _after(self) -> Row | None:
+    def _after(self) -> ReviewRow | None:
         """Return the row below the one that is shown; None at the end."""
         here = self._place()
         following = [] if here is None else self._rows[here + 1 : here + 2]

@@ -23,7 +23,7 @@ from sliplab.analysis.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED
 from sliplab.flows.ui.review import ShownTrial
 from sliplab.storage.schema.trial import Point
 from sliplab.storage.streams import U8
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 
 Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, Kind] = ("incipient", "gross")
@@ -70,7 +70,7 @@ class TimePlots:
         self._on_move = on_move
         self._quiet = False
         self._held: set[Kind] = set()
-        self._exact = Onsets()
+        self._exact = ReviewedOnsets()
         self._texts: dict[Kind, Label] = {}
         self._whole = (0.0, 1.0, 1.0)
         span = Range1d(0, 1)
@@ -192,7 +192,7 @@ class TimePlots:
             self._held.discard(kind)
             self._on_move()
 
-    def show(self, shown: ShownTrial, onsets: Onsets) -> None:
+    def show(self, shown: ShownTrial, onsets: ReviewedOnsets) -> None:
         """Show another trial, with these onset lines."""
         self.moved.title.text = "simulated" if shown.recording.simulated else ""
         moved = shown.displacement_px
@@ -236,7 +236,7 @@ class TimePlots:
         for text in self._texts.values():
             text.y = 1.05 * top
 
-    def place(self, onsets: Onsets) -> None:
+    def place(self, onsets: ReviewedOnsets) -> None:
         """Move the lines without calling `on_move`."""
         self._quiet = True
         try:
@@ -256,10 +256,10 @@ class TimePlots:
         now = self.onsets()
         time = None if time_s is None else _rounded(time_s)
         values = {f"{other}_ns": getattr(now, f"{other}_ns") for other in KINDS}
-        self.place(Onsets(**{**values, f"{kind}_ns": time}))
+        self.place(ReviewedOnsets(**{**values, f"{kind}_ns": time}))
         self._on_move()
 
-    def onsets(self) -> Onsets:
+    def onsets(self) -> ReviewedOnsets:
         """Return the lines' times; a line that was not moved keeps its time to the nanosecond."""
         found: dict[str, int | None] = {}
         for kind in KINDS:
@@ -268,7 +268,7 @@ class TimePlots:
                 found[f"{kind}_ns"] = getattr(self._exact, f"{kind}_ns") if line.visible else None
             else:
                 found[f"{kind}_ns"] = _rounded(float(line.location))
-        return Onsets(**found)
+        return ReviewedOnsets(**found)
 
     def cursor(self, time_s: float) -> None:
         """Mark the time of the frame that is shown."""

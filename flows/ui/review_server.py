@@ -25,7 +25,7 @@ from tornado.web import HTTPError
 
 from sliplab.flows.running.same_origin import own_hosts, refusal
 from sliplab.flows.ui.review import TrialList
-from sliplab.flows.ui.review_page import Page
+from sliplab.flows.ui.review_page import ReviewTab
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import user_name
 from sliplab.storage.trials.store import Store
@@ -55,7 +55,7 @@ def serving(
     with ThreadPoolExecutor(1, thread_name_prefix="review") as pool:
 
         def make(doc: Document) -> None:
-            Page(doc, trials, pool, who or user_name())
+            ReviewTab(doc, trials, pool, who or user_name())
 
         path = f"/{secrets.token_urlsafe(24)}"
         server = _server(path, make, port)

@@ -22,7 +22,7 @@ from bokeh.models import (
 
 from sliplab.analysis.labels.reviewed import STATES
 from sliplab.flows.ui.review import ShownTrial
-from sliplab.storage.trials.review import Decision, Onsets, Verdict
+from sliplab.storage.trials.review import Decision, ReviewedOnsets, Verdict
 
 ALL = "all"
 VERDICTS: tuple[tuple[Verdict, str, str], ...] = (
@@ -227,7 +227,7 @@ def heading_html(shown: ShownTrial, position: str) -> str:
     )
 
 
-def lines_html(shown: ShownTrial, onsets: Onsets) -> str:
+def lines_html(shown: ShownTrial, onsets: ReviewedOnsets) -> str:
     """Format the positions of the onset lines, and their distance from the label."""
     rows = []
     for kind in ("incipient", "gross"):

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import Any
 
-from sliplab.analysis.networks.models import Model
+from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.report.figures.windows import training_curves
 from sliplab.flows.running import console, orchestration
@@ -16,7 +16,9 @@ from sliplab.storage.files import write_text
 
 
 @contextmanager
-def training_progress(model: Model, epochs: int, simulated: bool) -> Iterator[TrainingProgress]:
+def training_progress(
+    model: ModelOnDisk, epochs: int, simulated: bool
+) -> Iterator[TrainingProgress]:
     """Show the training of a model while the block runs."""
     with console.bar(f"train {model.title} (epochs)", epochs) as bar:
         yield TrainingProgress(model, bar, simulated)
@@ -29,7 +31,7 @@ class TrainingProgress:
     has it.
     """
 
-    def __init__(self, model: Model, bar: Any, simulated: bool) -> None:
+    def __init__(self, model: ModelOnDisk, bar: Any, simulated: bool) -> None:
         self._model, self._bar, self._simulated = model, bar, simulated
         self._records: list[dict[str, float]] = []
         self._best: EpochRecord | None = None

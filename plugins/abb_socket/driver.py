@@ -17,7 +17,7 @@ from functools import partial
 from typing import TypeVar
 
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
-from sliplab.plugins.abb_socket.wire import Command, RapidError, RapidSocket, socket_health
+from sliplab.plugins.abb_socket.wire import RapidError, RapidSocket, ServerCommand, socket_health
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -76,8 +76,8 @@ class AbbSocketArm(ThreadedArm):
             self._link = RapidSocket(settings.host, settings.port, ANSWER_S)
             self._info = self._link.info(ANSWER_S)
             self._check_pose = PoseCheck(settings.limits.speed_mm_s)
-            self._ask(Command.SET_TCP, frame.xyz_mm, quaternion(frame))
-            self._ask(Command.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+            self._ask(ServerCommand.SET_TCP, frame.xyz_mm, quaternion(frame))
+            self._ask(ServerCommand.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
             self._settle(self._link)
         except RapidError as error:
             self._release()
@@ -129,7 +129,7 @@ class AbbSocketArm(ThreadedArm):
         begin = self.pose()
         self._guard.check(begin, path)
         with self._one:
-            self._guard.check_joints(self._watched(lambda: self._ask(Command.JOINTS)))
+            self._guard.check_joints(self._watched(lambda: self._ask(ServerCommand.JOINTS)))
         self._start_pose = begin
         self._run, self._may_move = Run(path), True
         self._begin(self._run)
@@ -237,18 +237,20 @@ class AbbSocketArm(ThreadedArm):
         seconds = distance_mm(begin, segment.to) / segment.speed_mm_s
         seconds = max(seconds, angle_deg(begin, segment.to) / TURN_DEG_S)
         pieces = max(1, math.ceil(seconds / self._settings.segment_s))
-        self._ask(Command.SET_SPEED, segment.speed_mm_s, TURN_DEG_S)
-        self._ask(Command.SET_ZONE, ZONE if pieces > 1 else FINE)
+        self._ask(ServerCommand.SET_SPEED, segment.speed_mm_s, TURN_DEG_S)
+        self._ask(ServerCommand.SET_ZONE, ZONE if pieces > 1 else FINE)
         for piece in range(1, pieces + 1):
             if run.cancelled:
                 self._settle(self._link)
                 self._may_move = False
                 return False
             if piece == pieces > 1:
-                self._ask(Command.SET_ZONE, FINE)
+                self._ask(ServerCommand.SET_ZONE, FINE)
             target = between(begin, segment.to, piece / pieces)
             bound_s = self._bound_s(seconds / pieces)
-            self._ask(Command.MOVE_LINEAR, target.xyz_mm, quaternion(target), within_s=bound_s)
+            self._ask(
+                ServerCommand.MOVE_LINEAR, target.xyz_mm, quaternion(target), within_s=bound_s
+            )
             self._read_pose()
         last = self._stream.last
         return last is not None and distance_mm(last.pose, segment.to) <= ARRIVED_MM
@@ -272,7 +274,7 @@ class AbbSocketArm(ThreadedArm):
         link = self._link if link is None else link
         if link is None:
             raise RapidError("there is no connection")
-        values = link.ask(Command.POSE, within_s=ANSWER_S)
+        values = link.ask(ServerCommand.POSE, within_s=ANSWER_S)
         answered = time.monotonic_ns()
         pose = from_quaternion(values[:3], values[3:])
         try:
@@ -284,7 +286,10 @@ class AbbSocketArm(ThreadedArm):
         self._stream.add(Sample((asked + answered) // 2, answered, pose.xyz_mm, pose.rotvec_deg))
 
     def _ask(
-        self, command: Command, *arguments: float | Sequence[float], within_s: float = ANSWER_S
+        self,
+        command: ServerCommand,
+        *arguments: float | Sequence[float],
+        within_s: float = ANSWER_S,
     ) -> tuple[float, ...]:
         if self._link is None:
             raise RapidError("there is no connection")

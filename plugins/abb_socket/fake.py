@@ -13,7 +13,7 @@ import asyncio
 import struct
 from collections.abc import Sequence
 
-from sliplab.plugins.abb_socket.wire import ARGUMENTS, Command
+from sliplab.plugins.abb_socket.wire import ARGUMENTS, ServerCommand
 from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
 from sliplab.rigs.core.fakes import (
@@ -100,12 +100,12 @@ class FakeRapidServer(ServedController):
             held = b""
             while True:
                 (number,) = struct.unpack(">H", await reader.readexactly(2))
-                if number == Command.CLOSE:
+                if number == ServerCommand.CLOSE:
                     return
-                if number not in list(Command):
+                if number not in list(ServerCommand):
                     writer.write(_REFUSED)
                     return
-                command = Command(number)
+                command = ServerCommand(number)
                 layout = struct.Struct(">" + ARGUMENTS[command])
                 values = layout.unpack(await reader.readexactly(layout.size))
                 self._faults.reach(Stage.CONNECTING)
@@ -118,26 +118,26 @@ class FakeRapidServer(ServedController):
                 writer.write(held + reply)
                 held = b""
 
-    async def _do(self, command: Command, values: tuple[float, ...]) -> bytes:
-        if command is Command.INFO:
+    async def _do(self, command: ServerCommand, values: tuple[float, ...]) -> bytes:
+        if command is ServerCommand.INFO:
             return _DONE + INFO
-        if command is Command.MOVE_LINEAR and self._speed_mm_s <= 0:
+        if command is ServerCommand.MOVE_LINEAR and self._speed_mm_s <= 0:
             return _REFUSED
-        if command is Command.MOVE_LINEAR:
+        if command is ServerCommand.MOVE_LINEAR:
             await self._move(from_quaternion(values[:3], values[3:]))
             return _DONE
-        if command is Command.SET_TCP:
+        if command is ServerCommand.SET_TCP:
             self.tool = from_quaternion(values[:3], values[3:])
-        elif command is Command.SET_SPEED:
+        elif command is ServerCommand.SET_SPEED:
             self._speed_mm_s = values[0]
-        elif command is Command.SET_ZONE:
+        elif command is ServerCommand.SET_ZONE:
             self._zone_mm = 0.0 if values[0] else values[1]
-        elif command is Command.JOINTS:
+        elif command is ServerCommand.JOINTS:
             return _DONE + struct.pack(">6f", *JOINTS_DEG)
-        elif command is Command.POSE:
+        elif command is ServerCommand.POSE:
             pose = self.pose()
             return _DONE + struct.pack(">7f", *pose.xyz_mm, *quaternion(pose))
-        elif command is not Command.SET_WORK_OBJECT or values != (0, 0, 0, 1, 0, 0, 0):
+        elif command is not ServerCommand.SET_WORK_OBJECT or values != (0, 0, 0, 1, 0, 0, 0):
             return _REFUSED  # joint moves, circular moves and other frames are not simulated
         return _DONE
 

@@ -20,7 +20,7 @@ _UNIT_TOLERANCE = 0.01
 """Largest deviation of a quaternion from length 1; the server sends single floats."""
 
 
-class Command(IntEnum):
+class ServerCommand(IntEnum):
     """Commands of the server."""
 
     INFO = 0
@@ -37,21 +37,21 @@ class Command(IntEnum):
 
 
 ARGUMENTS = {
-    Command.INFO: "",
-    Command.MOVE_JOINTS: "6f",
-    Command.MOVE_LINEAR: "7f",
-    Command.MOVE_CIRCULAR: "14f",
-    Command.SET_TCP: "7f",
-    Command.SET_WORK_OBJECT: "7f",
-    Command.SET_SPEED: "2f",
-    Command.SET_ZONE: "H3f",
-    Command.JOINTS: "",
-    Command.POSE: "",
-    Command.CLOSE: "",
+    ServerCommand.INFO: "",
+    ServerCommand.MOVE_JOINTS: "6f",
+    ServerCommand.MOVE_LINEAR: "7f",
+    ServerCommand.MOVE_CIRCULAR: "14f",
+    ServerCommand.SET_TCP: "7f",
+    ServerCommand.SET_WORK_OBJECT: "7f",
+    ServerCommand.SET_SPEED: "2f",
+    ServerCommand.SET_ZONE: "H3f",
+    ServerCommand.JOINTS: "",
+    ServerCommand.POSE: "",
+    ServerCommand.CLOSE: "",
 }
 """Arguments of each command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
 degrees/s; fine point, zone in mm, orientation zone in mm and in degrees."""
-RESULTS = {Command.JOINTS: 6, Command.POSE: 7}
+RESULTS = {ServerCommand.JOINTS: 6, ServerCommand.POSE: 7}
 """Count of numbers after the reply's first word."""
 
 
@@ -78,7 +78,7 @@ class RapidSocket:
             raise RapidError(f"no connection to {host}:{port}: {error}") from None
 
     def ask(
-        self, command: Command, *arguments: float | Sequence[float], within_s: float
+        self, command: ServerCommand, *arguments: float | Sequence[float], within_s: float
     ) -> tuple[float, ...]:
         """Send one request and return the numbers of its reply.
 
@@ -98,7 +98,7 @@ class RapidSocket:
                 raise RapidError(f"the answer to {command.name} begins with {fine}, not 0 or 1")
             if fine == 0:
                 raise RapidError(f"the controller refused {command.name}")
-            if command is Command.INFO:
+            if command is ServerCommand.INFO:
                 return ()
             numbers = struct.Struct(f">{RESULTS.get(command, 0)}f")
             values = numbers.unpack(self._receive(numbers.size))
@@ -106,7 +106,7 @@ class RapidSocket:
             raise RapidError(f"no answer to {command.name}: {error}") from None
         if not all(map(math.isfinite, values)):
             raise RapidError(f"the answer to {command.name} has a number that is not finite")
-        if command is Command.POSE and abs(math.hypot(*values[3:]) - 1) > _UNIT_TOLERANCE:
+        if command is ServerCommand.POSE and abs(math.hypot(*values[3:]) - 1) > _UNIT_TOLERANCE:
             raise RapidError("the answer to POSE has a quaternion whose norm is not 1")
         return values
 
@@ -116,7 +116,7 @@ class RapidSocket:
         Raises:
             RapidError: as `ask`; also if another client holds the only connection.
         """
-        self.ask(Command.INFO, within_s=within_s)
+        self.ask(ServerCommand.INFO, within_s=within_s)
         try:
             self._socket.expect(within_s)
             return self._socket.receive(4096).decode("ascii", errors="replace").strip()
@@ -126,7 +126,7 @@ class RapidSocket:
     def close(self) -> None:
         """Send CLOSE, so that the server accepts the next client, and close the socket."""
         try:
-            self._socket.sendall(_WORD.pack(Command.CLOSE))
+            self._socket.sendall(_WORD.pack(ServerCommand.CLOSE))
         except OSError:
             pass  # the connection is lost already
         finally:
@@ -139,7 +139,7 @@ class RapidSocket:
         return data
 
 
-def pack(command: Command, values: Sequence[float]) -> bytes:
+def pack(command: ServerCommand, values: Sequence[float]) -> bytes:
     """Encode the numbers of a request."""
     layout = ARGUMENTS[command]
     first = [int(values[0]), *values[1:]] if layout.startswith("H") else values

@@ -22,7 +22,7 @@ US_PER_HOUR = 3_600_000_000
 
 
 @dataclass(frozen=True)
-class Judged:
+class SceneEvidence:
     """Evidence on a scene with the truth, and the scene's world, empty if it shares none."""
 
     evidence: Evidence
@@ -31,7 +31,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SceneAlarms:
     """Alarms of one scene.
 
     Attributes:
@@ -57,25 +57,25 @@ def alarm_times(t_us: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.array(found, np.int64)
 
 
-def outcome(judged: Judged, level: float) -> Outcome:
+def outcome(judged: SceneEvidence, level: float) -> SceneAlarms:
     """Return a scene's alarms above a level."""
     slip, evidence = judged.slip, judged.evidence
     above = evidence.t_us[evidence.value > level]
     split = int(np.searchsorted(above, slip.physical_us))
     false = alarm_times(above[:split])
     if len(false) and false[-1] + ALARM_US > slip.physical_us:
-        return Outcome(slip, len(false), None, True)
+        return SceneAlarms(slip, len(false), None, True)
     after = above[split:]
     detected = int(after[0]) if len(after) and after[0] < slip.gross_us else None
-    return Outcome(slip, len(false), detected, False)
+    return SceneAlarms(slip, len(false), detected, False)
 
 
-def hours_without_slip(scenes: Sequence[Judged]) -> float:
+def hours_without_slip(scenes: Sequence[SceneEvidence]) -> float:
     """Return the hours of scenes in which nothing slips."""
     return sum(scene.slip.physical_us for scene in scenes) / US_PER_HOUR
 
 
-def level_at(scenes: Sequence[Judged], allowed: int) -> float:
+def level_at(scenes: Sequence[SceneEvidence], allowed: int) -> float:
     """Return the lowest level at which scenes have at most so many false alarms.
 
     Found exactly: fewer times exceed a higher level, and fewer times are in as many alarms at most.

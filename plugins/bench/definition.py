@@ -22,7 +22,7 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Part:
+class ScenePart:
     """Scenes of one part.
 
     Attributes:
@@ -42,9 +42,9 @@ class Size:
         nuisance: scenes of each nuisance, in as many worlds.
     """
 
-    train: Part
-    validation: Part
-    test: Part
+    train: ScenePart
+    validation: ScenePart
+    test: ScenePart
     nuisance: int
 
 
@@ -76,6 +76,6 @@ class Definition:
 
 DEFINITION = Definition()
 SIZES = {
-    "full": Size(Part(16, 9, 0), Part(12, 8, 30), Part(16, 12, 30), 4),
-    "small": Size(Part(4, 4, 0), Part(4, 4, 2), Part(6, 4, 2), 1),
+    "full": Size(ScenePart(16, 9, 0), ScenePart(12, 8, 30), ScenePart(16, 12, 30), 4),
+    "small": Size(ScenePart(4, 4, 0), ScenePart(4, 4, 2), ScenePart(6, 4, 2), 1),
 }

@@ -14,8 +14,8 @@ from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.metrics.intervals import median_interval
 from sliplab.plugins.bench.alarms import (
-    Judged,
-    Outcome,
+    SceneAlarms,
+    SceneEvidence,
     hours_without_slip,
     level_at,
     outcome,
@@ -46,7 +46,7 @@ class Level:
     value: float
 
 
-def validated(scenes: Sequence[Judged], rates: Sequence[float] = RATES) -> list[Level]:
+def validated(scenes: Sequence[SceneEvidence], rates: Sequence[float] = RATES) -> list[Level]:
     """Return the lowest level of each rate at which validation scenes keep it."""
     hours = hours_without_slip(scenes)
     found = []
@@ -56,7 +56,7 @@ def validated(scenes: Sequence[Judged], rates: Sequence[float] = RATES) -> list[
     return found
 
 
-def tested(scenes: Sequence[Judged], levels: Sequence[Level]) -> tuple[BenchPoint, ...]:
+def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[BenchPoint, ...]:
     """Return the scores of test scenes at levels that are set already."""
     return tuple(
         BenchPoint(
@@ -69,7 +69,7 @@ def tested(scenes: Sequence[Judged], levels: Sequence[Level]) -> tuple[BenchPoin
     )
 
 
-def scores(scenes: Sequence[Judged], level: float) -> BenchScores:
+def scores(scenes: Sequence[SceneEvidence], level: float) -> BenchScores:
     """Return the scores of scenes at a level."""
     outcomes = [outcome(scene, level) for scene in scenes]
     worlds = _worlds(scenes)
@@ -84,13 +84,13 @@ def scores(scenes: Sequence[Judged], level: float) -> BenchScores:
     )
 
 
-def _worlds(scenes: Sequence[Judged]) -> list[str]:
+def _worlds(scenes: Sequence[SceneEvidence]) -> list[str]:
     """Return the world of each scene; one that shares none has its place as a name."""
     return [scene.world or f"scene {place}" for place, scene in enumerate(scenes)]
 
 
 def _median(
-    outcomes: Sequence[Outcome], onsets_us: Sequence[int], worlds: Sequence[str]
+    outcomes: Sequence[SceneAlarms], onsets_us: Sequence[int], worlds: Sequence[str]
 ) -> MedianLatency:
     late = np.array(
         [
@@ -107,7 +107,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
 
 
-def _alarm_rate(scenes: Sequence[Judged], outcomes: Sequence[Outcome]) -> AlarmRate:
+def _alarm_rate(scenes: Sequence[SceneEvidence], outcomes: Sequence[SceneAlarms]) -> AlarmRate:
     """Return the rate of false alarms with its interval over worlds."""
     _, world = np.unique(_worlds(scenes), return_inverse=True)
     counts = np.bincount(world, [found.false for found in outcomes])
@@ -115,7 +115,7 @@ def _alarm_rate(scenes: Sequence[Judged], outcomes: Sequence[Outcome]) -> AlarmR
     return alarm_rate(counts, times)
 
 
-def accuracy(scenes: Sequence[Judged], length_us: int = 30_000) -> float | None:
+def accuracy(scenes: Sequence[SceneEvidence], length_us: int = 30_000) -> float | None:
     """Return the mean recall of the classes, of decisions on scenes; None without classes.
 
     Args:
@@ -158,12 +158,14 @@ def ranked(rows: Sequence[BenchDetector]) -> list[BenchDetector]:
     return sorted(rows, key=key)
 
 
-def nuisance_scores(scenes: Mapping[str, Sequence[Judged]], level: float) -> dict[str, BenchScores]:
+def nuisance_scores(
+    scenes: Mapping[str, Sequence[SceneEvidence]], level: float
+) -> dict[str, BenchScores]:
     """Return the scores at a level by nuisance."""
     return {name: scores(found, level) for name, found in scenes.items()}
 
 
-def disturbed_rate(scenes: Mapping[str, Sequence[Judged]], level: float) -> AlarmRate | None:
+def disturbed_rate(scenes: Mapping[str, Sequence[SceneEvidence]], level: float) -> AlarmRate | None:
     """Return false alarms in all scenes with nuisances at a level; None without such scenes."""
     every = [scene for found in scenes.values() for scene in found]
     return _alarm_rate(every, [outcome(scene, level) for scene in every]) if every else None

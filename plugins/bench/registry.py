@@ -28,7 +28,7 @@ from sliplab.protocols.shown import did_you_mean
 GROUP = "sliplab.detectors"
 _ENTRIES = "sliplab.plugins.bench.entries"
 SHIPPED = {
-    "paper": f"{_ENTRIES}.network:Paper",
+    "paper": f"{_ENTRIES}.network:PaperEntry",
     "ours": f"{_ENTRIES}.network:Ours",
     "paper_physical": f"{_ENTRIES}.network:PaperByPhysicalOnset",
     "ours_2px": f"{_ENTRIES}.network:OursByPaperOnset",
@@ -37,7 +37,7 @@ SHIPPED = {
     "gru": f"{_ENTRIES}.nets:Gru",
     "boosting": f"{_ENTRIES}.boosting:Boosting",
     "hyperdimensional": f"{_ENTRIES}.hyperdimensional:Hyperdimensional",
-    "rate": f"{_ENTRIES}.thresholds:Rate",
+    "rate": f"{_ENTRIES}.thresholds:EventRate",
     "flow": f"{_ENTRIES}.thresholds:Flow",
     "always": f"{_ENTRIES}.trivial:Always",
     "never": f"{_ENTRIES}.trivial:Never",
@@ -74,9 +74,9 @@ def make_detector(name: str) -> Detector:
         InputError: it does not exist, or cannot be created.
     """
     if name.startswith(PROGRAM):
-        from sliplab.plugins.bench.entries.program import Program
+        from sliplab.plugins.bench.entries.program import ExternalProcess
 
-        return Program(name.removeprefix(PROGRAM))
+        return ExternalProcess(name.removeprefix(PROGRAM))
     if name.endswith(ONNX):
         from sliplab.plugins.bench.entries.onnx_model import OnnxModel
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from sliplab.flows.running import console, stopping
 from sliplab.plugins.bench import scenes
-from sliplab.plugins.bench.alarms import Judged, hours_without_slip
+from sliplab.plugins.bench.alarms import SceneEvidence, hours_without_slip
 from sliplab.plugins.bench.definition import SIZES, VERSION, Size
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, KeptDetector
 from sliplab.plugins.bench.feeding import BenchError, audit, feed
@@ -34,7 +34,7 @@ from sliplab.plugins.bench.figures import (
 from sliplab.plugins.bench.interface import Detector, Evidence, Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.plugins.bench.registry import contents, make_detector
-from sliplab.plugins.bench.scenes import Drawn
+from sliplab.plugins.bench.scenes import SceneDraw
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import out_of_reach
 from sliplab.storage.trials.derived import Derived, make_key
@@ -46,7 +46,7 @@ Advance = Callable[[], None]
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingScenes:
     """Scenes that everybody knows: those that train, and those that choose."""
 
     train: Sequence[Scene]
@@ -70,7 +70,7 @@ class Prepared:
     train_s: float
 
 
-def prepare(detector: Detector, training: Training, advance: Advance) -> Prepared:
+def prepare(detector: Detector, training: TrainingScenes, advance: Advance) -> Prepared:
     """Train a detector, and set its levels on validation scenes.
 
     Args:
@@ -84,11 +84,11 @@ def prepare(detector: Detector, training: Training, advance: Advance) -> Prepare
     return Prepared(detector, validated(found), train_s)
 
 
-def judged(detector: Detector, given: Sequence[Scene], advance: Advance) -> list[Judged]:
+def judged(detector: Detector, given: Sequence[Scene], advance: Advance) -> list[SceneEvidence]:
     """Return a detector's evidence on scenes."""
     found = []
     for scene in given:
-        found.append(Judged(feed(detector, scene), scene.slip, scene.world))
+        found.append(SceneEvidence(feed(detector, scene), scene.slip, scene.world))
         advance()
     return found
 
@@ -115,7 +115,7 @@ def measure(name: str, prepared: Prepared, tests: Tests, advance: Advance) -> Be
 
 
 @dataclass
-class Bench:
+class BenchScenes:
     """The scenes of one size and seed, simulated when they are first needed.
 
     Attributes:
@@ -139,10 +139,10 @@ class Bench:
         return {**found, "nuisances": self.size.nuisance * len(NUISANCES)}
 
     @cached_property
-    def training(self) -> Training:
+    def training(self) -> TrainingScenes:
         """Scenes that train and choose."""
         train, validation = scenes.training_scenes(self.size)
-        return Training(self._simulated(train), self._simulated(validation))
+        return TrainingScenes(self._simulated(train), self._simulated(validation))
 
     @cached_property
     def tests(self) -> Tests:
@@ -163,14 +163,14 @@ class Bench:
         """Hours without slip of the validation and test scenes."""
         none = Evidence.of([], [])
         return {
-            name: hours_without_slip([Judged(none, scene.slip) for scene in part])
+            name: hours_without_slip([SceneEvidence(none, scene.slip) for scene in part])
             for name, part in (
                 ("validation", self.training.validation),
                 ("test", self.tests.scenes),
             )
         }
 
-    def _simulated(self, drawn: Sequence[Drawn]) -> list[Scene]:
+    def _simulated(self, drawn: Sequence[SceneDraw]) -> list[Scene]:
         found = []
         for one in drawn:
             found.append(scenes.simulated(one))
@@ -191,7 +191,7 @@ def _give_memory_back() -> None:
 
 
 @dataclass(frozen=True)
-class Job:
+class DetectorJob:
     """A detector to evaluate."""
 
     name: str
@@ -200,12 +200,12 @@ class Job:
 
 
 @lru_cache(maxsize=1)
-def _bench(size: Size, seed: int) -> Bench:
+def _bench(size: Size, seed: int) -> BenchScenes:
     """Return the scenes; a process simulates them once."""
-    return Bench(size, seed)
+    return BenchScenes(size, seed)
 
 
-def _judge(job: Job, advance: Advance | None = None) -> KeptDetector:
+def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
     """Evaluate a detector, in one thread of this process.
 
     Raises:
@@ -228,7 +228,9 @@ def _judge(job: Job, advance: Advance | None = None) -> KeptDetector:
     return KeptDetector(row=row, hours=bench.hours)
 
 
-def _judge_each(jobs: Sequence[Job], workers: int, done: Callable[[KeptDetector], None]) -> None:
+def _judge_each(
+    jobs: Sequence[DetectorJob], workers: int, done: Callable[[KeptDetector], None]
+) -> None:
     """Evaluate detectors, several at once in separate processes.
 
     Args:
@@ -292,14 +294,14 @@ def run_bench(
 
     missing = [name for name, key in keys.items() if not kept.fresh(key[:16], key)]
     if missing:
-        _judge_each([Job(name, SIZES[size], seed) for name in missing], workers, keep)
+        _judge_each([DetectorJob(name, SIZES[size], seed) for name in missing], workers, keep)
     found = [kept.load(key[:16], KeptDetector) for key in keys.values()]
     return BenchResult(
         simulated=True,
         version=VERSION,
         size=size,
         seed=seed,
-        scenes=Bench(SIZES[size], seed).counts,
+        scenes=BenchScenes(SIZES[size], seed).counts,
         hours=found[0].hours,
         detectors=tuple(ranked([one.row for one in found])),
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
-from sliplab.plugins.bench.definition import DEFINITION, VERSION, Part, Size, Span
+from sliplab.plugins.bench.definition import DEFINITION, VERSION, ScenePart, Size, Span
 from sliplab.plugins.bench.interface import Scene, Slip
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
 from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
@@ -32,7 +32,7 @@ AFTER_GROSS_US = 1_500_000
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SceneDraw:
     """A scene before it is simulated.
 
     Attributes:
@@ -51,21 +51,21 @@ class Drawn:
     faults: tuple[AnyFault, ...] = ()
 
 
-def training_scenes(size: Size) -> tuple[list[Drawn], list[Drawn]]:
+def training_scenes(size: Size) -> tuple[list[SceneDraw], list[SceneDraw]]:
     """Return the scenes that train and that choose, the same for everybody."""
     train = list(_part("train", size.train, DEFINITION.train_seed))
     return train, list(_part("validation", size.validation, DEFINITION.validation_seed))
 
 
-def test_scenes(size: Size, seed: int) -> list[Drawn]:
+def test_scenes(size: Size, seed: int) -> list[SceneDraw]:
     """Return test scenes in worlds that a seed draws."""
     return list(_part("test", size.test, hash_integer("bench test", VERSION, seed)))
 
 
-def nuisance_scenes(size: Size, seed: int) -> dict[str, list[Drawn]]:
+def nuisance_scenes(size: Size, seed: int) -> dict[str, list[SceneDraw]]:
     """Return scenes with each nuisance, in worlds that a seed draws; the same in each."""
     drawn_by = hash_integer("bench nuisances", VERSION, seed)
-    found: dict[str, list[Drawn]] = {}
+    found: dict[str, list[SceneDraw]] = {}
     for name in NUISANCES:
         found[name] = []
         for number in range(size.nuisance):
@@ -79,7 +79,7 @@ def nuisance_scenes(size: Size, seed: int) -> dict[str, list[Drawn]]:
     return found
 
 
-def _part(name: str, part: Part, seed: int) -> Iterator[Drawn]:
+def _part(name: str, part: ScenePart, seed: int) -> Iterator[SceneDraw]:
     worlds = [_world(seed, number) for number in range(part.worlds)]
     for number, rig in enumerate(worlds):
         for slide in range(part.slides):
@@ -111,10 +111,10 @@ def _drawn(
     hold_s: float,
     rng: np.random.Generator,
     faults: tuple[AnyFault, ...] = (),
-) -> Drawn:
+) -> SceneDraw:
     heights_mm = rig.scene.scene.skin.heights_mm
     touching_mm = max(heights_mm) - min(heights_mm)
-    return Drawn(
+    return SceneDraw(
         name,
         world,
         rig,
@@ -134,7 +134,7 @@ def _value(span: Span, rng: np.random.Generator) -> float:
     return round(float(rng.uniform(span.low, span.high)), 2)
 
 
-def simulated(drawn: Drawn) -> Scene:
+def simulated(drawn: SceneDraw) -> Scene:
     """Simulate a scene.
 
     Raises:
@@ -177,7 +177,7 @@ def simulated(drawn: Drawn) -> Scene:
     return Scene(drawn.name, kept, *size, int(end_us), slip, drawn.world)
 
 
-def _plan(drawn: Drawn) -> Plan:
+def _plan(drawn: SceneDraw) -> Plan:
     """Return a plan of one slide after a hold."""
     protocol = {
         "protocol": 1,

@@ -40,7 +40,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanEstimate:
     """An estimate of a mean between 0 and 1.
 
     Attributes:
@@ -128,9 +128,9 @@ class Estimate:
         part = mean / self.value if above else (1.0 - mean) / (1.0 - self.value)
         return _normal(max(part, 0.0) ** self.blocks)
 
-    def minus(self, other: Estimate) -> Estimate:
+    def minus(self, other: MeanEstimate) -> MeanEstimate:
         """Return the estimate of the difference of two means, of the same blocks."""
-        return Estimate(self.value - other.value, self.scores - other.scores, True)
+        return MeanEstimate(self.value - other.value, self.scores - other.scores, True)
 
 
 def _normal(chance: float) -> float:
@@ -138,7 +138,7 @@ def _normal(chance: float) -> float:
     return -float(ndtri(min(max(chance, _LEAST_CHANCE), 1.0)))
 
 
-def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> Estimate:
+def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> MeanEstimate:
     """Return an estimate that is a weighted sum over trials.
 
     Args:
@@ -146,7 +146,7 @@ def of_trials(value: float, off: F64, weights: F64, blocks: I64, count: int) -> 
             in the estimate. blocks: (n,) number of each trial's block, from 0; count: of blocks.
     """
     parts = np.bincount(blocks, weights * off, minlength=count)
-    return Estimate(value, np.asarray(count * parts, np.float64))
+    return MeanEstimate(value, np.asarray(count * parts, np.float64))
 
 
 def block_share(off: F64, blocks: I64, least: int = 3) -> tuple[float, float]:

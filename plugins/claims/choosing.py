@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliplab.plugins.claims.blocks import F64, I64
-from sliplab.plugins.claims.document import Batch, ChosenTrial
-from sliplab.plugins.claims.evidence import Evidence, Grid, members_of
-from sliplab.plugins.claims.states import Fits, History, estimate_of, is_called, state_of
-from sliplab.protocols.claims import QUANTILES, Choice, Claim, Stopping
+from sliplab.plugins.claims.document import ChosenTrial, TrialBatch
+from sliplab.plugins.claims.evidence import ClaimEvidence, TrialGrid, members_of
+from sliplab.plugins.claims.states import ClaimHistory, Fits, estimate_of, is_called, state_of
+from sliplab.protocols.claims import QUANTILES, AdaptiveChoice, Claim, Stopping
 from sliplab.protocols.hashing import hash_integer
 
 CENTRE = 0.2, 0.8
@@ -24,13 +24,13 @@ weights would decide."""
 
 
 def next_batch(
-    known: Evidence,
-    chosen: Sequence[Batch],
+    known: ClaimEvidence,
+    chosen: Sequence[TrialBatch],
     stopping: Stopping,
-    choice: Choice,
+    choice: AdaptiveChoice,
     seed: int,
     fits: Fits | None = None,
-) -> Batch | None:
+) -> TrialBatch | None:
     """Choose the trials that follow `chosen`; None if none are left.
 
     A round has a batch of every stretch between two changes by a person. The first round fills the
@@ -59,8 +59,8 @@ def next_batch(
             ChosenTrial(trial=grid.trials[k].id, chance=None)
             for k in spread_out(grid, here, count, rng)
         ]
-        return Batch(known=0, least=None, trials=tuple(items))
-    history = History(known, stopping, {} if fits is None else fits)
+        return TrialBatch(known=0, least=None, trials=tuple(items))
+    history = ClaimHistory(known, stopping, {} if fits is None else fits)
     share = chances(history, here, choice.random)
     items = []
     p = share.copy()
@@ -69,10 +69,10 @@ def next_batch(
         k = int(rng.choice(len(here), p=p))
         items.append(ChosenTrial(trial=grid.trials[here[k]].id, chance=float(p[k])))
         p[k] = 0.0
-    return Batch(known=len(known.taken), least=float(share.min()), trials=tuple(items))
+    return TrialBatch(known=len(known.taken), least=float(share.min()), trials=tuple(items))
 
 
-def chances(history: History, here: I64, random: float) -> F64:
+def chances(history: ClaimHistory, here: I64, random: float) -> F64:
     """Return the chance of each trial of `here`, (k,), all above 0.
 
     Args:
@@ -91,7 +91,7 @@ def chances(history: History, here: I64, random: float) -> F64:
     return even if total.sum() == 0.0 else random * even + (1.0 - random) * total / total.sum()
 
 
-def _spread(claim: Claim, history: History) -> F64:
+def _spread(claim: Claim, history: ClaimHistory) -> F64:
     """Return the spread that each trial of the grid is expected to add to a claim's estimate."""
     grid = history.evidence.grid
     found = np.zeros(len(grid.trials))
@@ -111,7 +111,7 @@ def _spread(claim: Claim, history: History) -> F64:
     return found
 
 
-def spread_out(grid: Grid, here: I64, count: int, rng: np.random.Generator) -> list[int]:
+def spread_out(grid: TrialGrid, here: I64, count: int, rng: np.random.Generator) -> list[int]:
     """Choose trials that lie far from each other in the grid, the first by chance.
 
     The distance of two trials is the sum over factors of that of their levels, as a share of the

@@ -74,7 +74,7 @@ class ChosenTrial(Part):
     """With which it was drawn from what was left; null: by its place in the grid."""
 
 
-class Batch(Part):
+class TrialBatch(Part):
     """Trials that were chosen at once."""
 
     known: Int
@@ -88,7 +88,7 @@ class ChoiceRecord(Document):
     """The order of an adaptive campaign, written before it is taken: `choices.json`."""
 
     simulated: Bool
-    batches: tuple[Batch, ...] = ()
+    batches: tuple[TrialBatch, ...] = ()
 
     @staticmethod
     def of(campaign: Path) -> ChoiceRecord:

@@ -10,16 +10,16 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.plugins.claims.blocks import F64, I64, Estimate, of_trials
+from sliplab.plugins.claims.blocks import F64, I64, MeanEstimate, of_trials
 from sliplab.protocols import Plan, Trial
-from sliplab.protocols.claims import Claim, Difference, Stopping
+from sliplab.protocols.claims import Claim, LevelDifference, Stopping
 from sliplab.protocols.factors import Factor
 
 Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Grid:
+class TrialGrid:
     """The measured trials of a plan, numbered in its order.
 
     Attributes:
@@ -34,7 +34,7 @@ class Grid:
     stretch: I64
 
     @staticmethod
-    def of(plan: Plan) -> Grid:
+    def of(plan: Plan) -> TrialGrid:
         """Return the grid of a plan."""
         trials = tuple(trial for trial in plan if trial.role == "measured")
         factors = plan.protocol.collection.all_factors
@@ -43,7 +43,7 @@ class Grid:
         by_person = [factor.changeover == "person" for factor in factors.values()]
         table = np.array(levels, np.int64).reshape(len(trials), len(factors))
         kinds = np.unique(table[:, by_person], axis=0, return_inverse=True)[1]
-        return Grid(trials, factors, table, np.asarray(kinds, np.int64).reshape(len(trials)))
+        return TrialGrid(trials, factors, table, np.asarray(kinds, np.int64).reshape(len(trials)))
 
     @property
     def stretches(self) -> int:
@@ -66,7 +66,7 @@ class Grid:
         """(N,) number of each trial's repetition, from 1."""
         return np.array([trial.repetition for trial in self.trials], np.int64)
 
-    def members(self, between: Difference, place: int) -> Mask:
+    def members(self, between: LevelDifference, place: int) -> Mask:
         """Return which trials have one of two compared levels."""
         name, level = between.factor, between.levels[place]
         if (name, level) not in self._members:
@@ -80,7 +80,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ClaimEvidence:
     """Trials of the rounds so far, and their figures.
 
     Attributes:
@@ -93,7 +93,7 @@ class Evidence:
         block: trials in a row that may resemble each other; None: all of a repetition.
     """
 
-    grid: Grid
+    grid: TrialGrid
     taken: I64
     looks: I64
     values: dict[str, F64]
@@ -142,10 +142,10 @@ class Evidence:
         since[self.taken] = self.rounds
         return np.asarray(np.arange(len(self.looks))[:, None] <= since)
 
-    def until(self, look: int) -> Evidence:
+    def until(self, look: int) -> ClaimEvidence:
         """Return the evidence at an earlier look, by its number."""
         n = int(self.looks[look])
-        return Evidence(
+        return ClaimEvidence(
             self.grid,
             self.taken[:n],
             self.looks[: look + 1],
@@ -155,14 +155,14 @@ class Evidence:
         )
 
 
-def members_of(claim: Claim, grid: Grid) -> list[Mask]:
+def members_of(claim: Claim, grid: TrialGrid) -> list[Mask]:
     """Return the trials that a claim is about: all, or those of either of two levels."""
     if claim.between is None:
         return [np.ones(len(grid.trials), np.bool_)]
     return [grid.members(claim.between, place) for place in (0, 1)]
 
 
-def round_ends(grid: Grid, stopping: Stopping) -> I64:
+def round_ends(grid: TrialGrid, stopping: Stopping) -> I64:
     """Return how many trials of a planned order there are at the end of each round.
 
     A round with which there would be more than `most` is left out, unless it is the first.
@@ -173,14 +173,14 @@ def round_ends(grid: Grid, stopping: Stopping) -> I64:
     return np.asarray(ends, np.int64)
 
 
-def planned_end(grid: Grid, stopping: Stopping, *, adaptive: bool) -> int:
+def planned_end(grid: TrialGrid, stopping: Stopping, *, adaptive: bool) -> int:
     """Return the number of trials of a campaign that no claim ends."""
     if adaptive:
         return min(len(grid.trials), stopping.most or len(grid.trials))
     return int(round_ends(grid, stopping)[-1])
 
 
-def planned_estimate(evidence: Evidence, x: F64, members: Mask, expected: F64) -> Estimate:
+def planned_estimate(evidence: ClaimEvidence, x: F64, members: Mask, expected: F64) -> MeanEstimate:
     """Return an estimate of the mean of `x`, each condition alike, in the order of the plan.
 
     Args:
@@ -192,15 +192,15 @@ def planned_estimate(evidence: Evidence, x: F64, members: Mask, expected: F64) -
     count = int(evidence.block_count[-1]) if len(evidence.looks) else 0
     n = int(used.sum())
     if not n:
-        return Estimate(float("nan"), np.zeros(count))
+        return MeanEstimate(float("nan"), np.zeros(count))
     off = np.where(used, x - expected[evidence.taken], 0.0)
     weights = used / n
     return of_trials(float(x[used].mean()), off, weights, evidence.blocks, count)
 
 
 def chosen_estimate(
-    evidence: Evidence, x: F64, members: Mask, expected: F64, latest: F64
-) -> Estimate:
+    evidence: ClaimEvidence, x: F64, members: Mask, expected: F64, latest: F64
+) -> MeanEstimate:
     """Return an estimate of the mean of `x`, each condition alike, of trials chosen by chance.
 
     At each draw what was taken is known, what is left is expected, and the drawn trial corrects
@@ -230,7 +230,7 @@ def chosen_estimate(
         if not size:
             continue
         if not by_chance.any():
-            return Estimate(float("nan"), np.zeros(count))
+            return MeanEstimate(float("nan"), np.zeros(count))
         of = rounds[drawn]
         inside = ours[taken[drawn]]
         away = np.where(inside, value[drawn] - guess[drawn], 0.0)

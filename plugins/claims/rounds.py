@@ -33,7 +33,7 @@ from sliplab.plugins.claims.document import (
     StoppingRecord,
     TrialFigures,
 )
-from sliplab.plugins.claims.evidence import Evidence, Grid
+from sliplab.plugins.claims.evidence import ClaimEvidence, TrialGrid
 from sliplab.plugins.claims.shown import count_text, verdict_text
 from sliplab.plugins.claims.states import Fits, settled, states
 from sliplab.protocols import Trial
@@ -63,7 +63,7 @@ class ClaimWatch:
         self._choice = collection.adaptive
         analysis = run_request.plan.protocol.analysis
         self._judge = figures.Judge(analysis, run_request.judging_model)
-        self._grid = Grid.of(run_request.plan)
+        self._grid = TrialGrid.of(run_request.plan)
         self._batches = ChoiceRecord.of(campaign.folder).batches
         self._kept = Derived.of(store, figures.STEP, campaign.name)
         self._making: dict[str, Future[TrialFigures]] = {}
@@ -201,7 +201,7 @@ class ClaimWatch:
 
     # evidence and looks
 
-    def _evidence(self, last: int) -> Evidence:
+    def _evidence(self, last: int) -> ClaimEvidence:
         """Return the evidence of the rounds up to one."""
         grid, there = self._grid, self._campaign.committed()
         taken: list[int] = []
@@ -228,7 +228,7 @@ class ClaimWatch:
             claim.figure: np.array([each.of(claim.figure) for each in made], np.float64)
             for claim in self._stopping.claims
         }
-        return Evidence(
+        return ClaimEvidence(
             grid,
             np.array(taken, np.int64),
             np.array(looks, np.int64),

@@ -13,8 +13,8 @@ import numpy as np
 
 from sliplab.plugins.claims.blocks import F64, I64
 from sliplab.plugins.claims.choosing import next_batch
-from sliplab.plugins.claims.document import Batch, ClaimState
-from sliplab.plugins.claims.evidence import Evidence, Grid, round_ends
+from sliplab.plugins.claims.document import ClaimState, TrialBatch
+from sliplab.plugins.claims.evidence import ClaimEvidence, TrialGrid, round_ends
 from sliplab.plugins.claims.states import Fits, is_called, states
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import Stopping
@@ -24,7 +24,7 @@ PERCENT = 100.0
 
 
 @dataclass(frozen=True)
-class Called:
+class ClaimOutcome:
     """Outcome of a claim.
 
     Attributes:
@@ -37,7 +37,7 @@ class Called:
 
 
 @dataclass(frozen=True)
-class Course:
+class CampaignCourse:
     """Course of a campaign.
 
     Attributes:
@@ -46,12 +46,14 @@ class Course:
         ended: trials of the campaign where its claims ended it; None: they did not.
     """
 
-    evidence: Evidence
-    claims: tuple[Called, ...]
+    evidence: ClaimEvidence
+    claims: tuple[ClaimOutcome, ...]
     ended: int | None
 
 
-def course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None) -> Course:
+def course(
+    plan: Plan, grid: TrialGrid, values: Figures, over_time: Figures | None = None
+) -> CampaignCourse:
     """Return the course of a campaign of a plan with claims.
 
     Args:
@@ -64,7 +66,9 @@ def course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = 
     evidence = planned_evidence(plan, grid, values, over_time)
     claims = _called(evidence, stopping)
     settled = _settled(evidence, claims, stopping.least)
-    return Course(evidence, claims, None if settled is None else int(evidence.looks[settled]))
+    return CampaignCourse(
+        evidence, claims, None if settled is None else int(evidence.looks[settled])
+    )
 
 
 def claims_of(plan: Plan) -> Stopping:
@@ -74,7 +78,7 @@ def claims_of(plan: Plan) -> Stopping:
     return stopping
 
 
-def _settled(evidence: Evidence, claims: Sequence[Called], least: int) -> int | None:
+def _settled(evidence: ClaimEvidence, claims: Sequence[ClaimOutcome], least: int) -> int | None:
     """Return the first look at which all claims are called; None before it."""
     called = [it.look for it in claims if it.look is not None]
     if len(called) < len(claims):
@@ -94,8 +98,8 @@ def _shown(values: Figures, taken: I64, over_time: Figures | None) -> Figures:
 
 
 def planned_evidence(
-    plan: Plan, grid: Grid, values: Figures, over_time: Figures | None = None
-) -> Evidence:
+    plan: Plan, grid: TrialGrid, values: Figures, over_time: Figures | None = None
+) -> ClaimEvidence:
     """Return all evidence of a campaign in its plan's order, with a look after each round.
 
     A round with which it would take more trials than it may is left out.
@@ -104,10 +108,10 @@ def planned_evidence(
     ends = round_ends(grid, stopping)
     taken = np.argsort(grid.repetition, kind="stable")[: ends[-1]]
     shown = _shown(values, taken, over_time)
-    return Evidence(grid, taken, ends, shown, block=stopping.block)
+    return ClaimEvidence(grid, taken, ends, shown, block=stopping.block)
 
 
-def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
+def _called(evidence: ClaimEvidence, stopping: Stopping) -> tuple[ClaimOutcome, ...]:
     """Return how claims come out; once all are called, no later look is made."""
     looks: list[int | None] = [None] * len(stopping.claims)
     at_call: dict[int, ClaimState] = {}
@@ -120,14 +124,16 @@ def _called(evidence: Evidence, stopping: Stopping) -> tuple[Called, ...]:
                 looks[k], at_call[k] = look, state
         if None not in looks:
             break
-    return tuple(Called(look, at_call.get(k, found[k])) for k, look in enumerate(looks))
+    return tuple(ClaimOutcome(look, at_call.get(k, found[k])) for k, look in enumerate(looks))
 
 
-def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures | None) -> Course:
+def _chosen_course(
+    plan: Plan, grid: TrialGrid, values: Figures, over_time: Figures | None
+) -> CampaignCourse:
     """Return the course of an adaptive campaign: it takes one more round than it needs."""
     stopping = claims_of(plan)
-    called: dict[int, Called] = {}
-    claims: tuple[Called, ...] = ()
+    called: dict[int, ClaimOutcome] = {}
+    claims: tuple[ClaimOutcome, ...] = ()
     fits: Fits = {}
     found: tuple[ClaimState, ...] = ()
     rounds = chosen_evidence(plan, grid, values, fits, over_time)
@@ -136,8 +142,8 @@ def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures |
         found = states(evidence, stopping, fits, found)
         for number, state in enumerate(found):
             if is_called(state):
-                called.setdefault(number, Called(len(evidence.looks) - 1, state))
-        claims = tuple(called.get(k, Called(None, state)) for k, state in enumerate(found))
+                called.setdefault(number, ClaimOutcome(len(evidence.looks) - 1, state))
+        claims = tuple(called.get(k, ClaimOutcome(None, state)) for k, state in enumerate(found))
         settled = _settled(evidence, claims, stopping.least) is not None
         following = next(rounds, None)
         too_many = following is not None and len(following.taken) > (stopping.most or math.inf)
@@ -146,12 +152,12 @@ def _chosen_course(plan: Plan, grid: Grid, values: Figures, over_time: Figures |
         evidence = following
         if settled:
             break
-    return Course(evidence, claims, len(evidence.taken) if settled else None)
+    return CampaignCourse(evidence, claims, len(evidence.taken) if settled else None)
 
 
 def chosen_evidence(
-    plan: Plan, grid: Grid, values: Figures, fits: Fits, over_time: Figures | None = None
-) -> Iterator[Evidence]:
+    plan: Plan, grid: TrialGrid, values: Figures, fits: Fits, over_time: Figures | None = None
+) -> Iterator[ClaimEvidence]:
     """Yield an adaptive campaign's evidence after each round, up to the whole grid.
 
     Args:
@@ -159,7 +165,7 @@ def chosen_evidence(
     """
     stopping, choice = claims_of(plan), plan.protocol.collection.adaptive
     assert choice is not None
-    batches: list[Batch] = []
+    batches: list[TrialBatch] = []
     looks: list[int] = []
     while True:
         # the next batch does not wait for the last round's figures
@@ -176,16 +182,16 @@ def chosen_evidence(
 
 
 def _seen(
-    grid: Grid,
-    batches: Sequence[Batch],
+    grid: TrialGrid,
+    batches: Sequence[TrialBatch],
     looks: Sequence[int],
     values: Figures,
     over_time: Figures | None,
-) -> Evidence:
+) -> ClaimEvidence:
     """Return the evidence of rounds that end at `looks`."""
     items = [(item, batch) for batch in batches for item in batch.trials]
     items = items[: looks[-1] if looks else 0]
     taken = np.array([grid.number[item.trial] for item, _ in items], np.int64)
     chances = np.array([item.chance for item, _ in items], np.float64)
     shown = _shown(values, taken, over_time)
-    return Evidence(grid, taken, np.array(looks, np.int64), shown, chances)
+    return ClaimEvidence(grid, taken, np.array(looks, np.int64), shown, chances)

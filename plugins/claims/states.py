@@ -13,11 +13,11 @@ from typing import Literal
 
 import numpy as np
 
-from sliplab.plugins.claims.blocks import F64, Estimate, Limit, block_share
+from sliplab.plugins.claims.blocks import F64, Limit, MeanEstimate, block_share
 from sliplab.plugins.claims.boundaries import boundaries
 from sliplab.plugins.claims.document import ClaimState
 from sliplab.plugins.claims.evidence import (
-    Evidence,
+    ClaimEvidence,
     Mask,
     chosen_estimate,
     members_of,
@@ -34,7 +34,7 @@ Fits = dict[tuple[str, bytes], Expectation]
 
 
 def states(
-    evidence: Evidence,
+    evidence: ClaimEvidence,
     stopping: Stopping,
     fits: Fits | None = None,
     earlier: Sequence[ClaimState] = (),
@@ -45,7 +45,7 @@ def states(
         fits: of earlier looks at the same campaign; those made here are added.
         earlier: the states at the look before; what was called then stays so.
     """
-    history = History(evidence, stopping, {} if fits is None else fits)
+    history = ClaimHistory(evidence, stopping, {} if fits is None else fits)
     found = [state_of(claim, history) for claim in stopping.claims]
     for k, before in enumerate(earlier):
         if is_called(before):
@@ -70,10 +70,10 @@ def settled(found: Sequence[ClaimState]) -> bool:
 
 
 @dataclass(frozen=True)
-class History:
+class ClaimHistory:
     """Evidence, and the expectations over the grid when each round began."""
 
-    evidence: Evidence
+    evidence: ClaimEvidence
     stopping: Stopping
     fits: Fits = field(default_factory=dict)
 
@@ -121,7 +121,7 @@ class History:
 
     def share_below(
         self, figure: str, value: float, members: Mask, *, at: bool, missing: float | None = None
-    ) -> Estimate:
+    ) -> MeanEstimate:
         """Return the share of trials whose figure is below a value.
 
         Args:
@@ -137,11 +137,11 @@ class History:
         return self._shares[key]
 
     @cached_property
-    def _shares(self) -> dict[tuple[object, ...], Estimate]:
+    def _shares(self) -> dict[tuple[object, ...], MeanEstimate]:
         """Shares below values, which claims about one figure have in common."""
         return {}
 
-    def mean(self, figure: str, members: Mask, missing: float | None = None) -> Estimate:
+    def mean(self, figure: str, members: Mask, missing: float | None = None) -> MeanEstimate:
         """Return the mean of a share in percent, as a number from 0 to 1; see `share_below`."""
 
         def guess(fit: Expectation) -> F64:
@@ -157,7 +157,7 @@ class History:
         members: Mask,
         guess: Callable[[Expectation], F64],
         missing: float | None,
-    ) -> Estimate:
+    ) -> MeanEstimate:
         evidence = self.evidence
         if missing is not None:
             x = np.where(np.isnan(x), missing, x)
@@ -167,7 +167,7 @@ class History:
         return chosen_estimate(evidence, x, members, guess(self.expected(figure)), latest)
 
 
-def state_of(claim: Claim, history: History) -> ClaimState:
+def state_of(claim: Claim, history: ClaimHistory) -> ClaimState:
     """Return the state of a claim by the last look alone.
 
     A claim of a bound is called by a bound that is wrong with the stated error; one of a width by
@@ -214,7 +214,7 @@ def state_of(claim: Claim, history: History) -> ClaimState:
 
 def _called(
     claim: Claim,
-    history: History,
+    history: ClaimHistory,
     groups: Sequence[Mask],
     span: tuple[float, float],
     *,
@@ -238,7 +238,7 @@ def _called(
 
 
 def _bound_verdict(
-    claim: Claim, history: History, members: Mask, *, worst: bool, trend: bool
+    claim: Claim, history: ClaimHistory, members: Mask, *, worst: bool, trend: bool
 ) -> tuple[bool, bool]:
     """Return whether a claim of a bound holds, and is refuted."""
     value, least = claim.value, claim.at_least is not None
@@ -255,7 +255,7 @@ def _bound_verdict(
     share = QUANTILES[claim.of]
     # at least v: fewer than the share lie below v; at most v: more than the share lie at most at v
 
-    def under(missing: float | None) -> Estimate:
+    def under(missing: float | None) -> MeanEstimate:
         return history.share_below(claim.figure, value, members, at=not least, missing=missing)
 
     fewer = under(all_).is_beyond(share, limit, above=False)
@@ -264,7 +264,7 @@ def _bound_verdict(
 
 
 def _interval(
-    claim: Claim, history: History, groups: Sequence[Mask], *, worst: bool
+    claim: Claim, history: ClaimHistory, groups: Sequence[Mask], *, worst: bool
 ) -> tuple[float, float]:
     """Return the interval of a claim's statistic, or of a difference."""
     none, all_ = (0.0, 1.0) if worst else (None, None)
@@ -284,7 +284,7 @@ def _interval(
 
 
 def _mean_bounds(
-    low: Estimate, high: Estimate, limit: Limit, *, least: float
+    low: MeanEstimate, high: MeanEstimate, limit: Limit, *, least: float
 ) -> tuple[float, float]:
     """Return bounds of a mean, or of a difference of two, in percent.
 
@@ -308,7 +308,7 @@ def _border(wrong: Callable[[float], bool], inside: float, outside: float) -> fl
 
 
 def _percentile_bounds(
-    claim: Claim, history: History, members: Mask, limit: Limit, worst: bool
+    claim: Claim, history: ClaimHistory, members: Mask, limit: Limit, worst: bool
 ) -> tuple[float, float]:
     """Return bounds of a percentile."""
     if not np.isfinite(limit.boundary):
@@ -341,14 +341,14 @@ def _first(values: F64, found: Callable[[float], bool]) -> int:
     return begin
 
 
-def _values(claim: Claim, history: History, members: Mask) -> F64:
+def _values(claim: Claim, history: ClaimHistory, members: Mask) -> F64:
     """Return the different figures of some trials, rising."""
     evidence = history.evidence
     values = np.unique(evidence.values[claim.figure][members[evidence.taken]])
     return np.asarray(values[~np.isnan(values)])
 
 
-def _estimate_of(claim: Claim, history: History, groups: Sequence[Mask]) -> float | None:
+def _estimate_of(claim: Claim, history: ClaimHistory, groups: Sequence[Mask]) -> float | None:
     found = [estimate_of(claim, history, members) for members in groups]
     if len(found) == 1:
         return found[0]
@@ -356,7 +356,7 @@ def _estimate_of(claim: Claim, history: History, groups: Sequence[Mask]) -> floa
     return None if first is None or second is None else second - first
 
 
-def estimate_of(claim: Claim, history: History, members: Mask) -> float | None:
+def estimate_of(claim: Claim, history: ClaimHistory, members: Mask) -> float | None:
     """Return a mean, or the value that the share of a percentile does not exceed.
 
     Trials without a figure are left out.

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import PlainSerializer
 
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 from sliplab.storage.schema.evaluation import (
     Accuracy,
@@ -121,7 +121,7 @@ class CardModel(ModelFile):
 
     seed: Int
     parameters: Int
-    network: Annotated[Network, _whole]
+    network: Annotated[NetworkSettings, _whole]
     windows: Annotated[Windows, _whole]
     training: Annotated[Training, _whole]
     epochs: Int

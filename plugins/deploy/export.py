@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.evaluation.trials import latencies
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.activity import activity
@@ -75,7 +75,7 @@ class _Source:
     fitted: Fitted
     store: Store
     campaigns: list[Collected]
-    labels: Labels
+    labels: StoreLabels
 
     @property
     def simulated(self) -> bool:
@@ -282,7 +282,7 @@ def export_files(
     if training_settings(campaigns).windows != fitted.windows:
         file = training_campaigns(campaigns)[0].campaign.protocol_file
         raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
-    source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
+    source = _Source(model, sha256(model), fitted, store, campaigns, StoreLabels(store))
     files: dict[str, bytes | str] = {}
     made_from_these = _made_from_these(source)
     samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}

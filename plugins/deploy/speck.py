@@ -25,7 +25,7 @@ from sliplab.plugins.deploy.document import (
     PlacedLayer,
     SpeckDescription,
 )
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 KI = 1024
 
@@ -167,7 +167,7 @@ class SpeckFit:
         )
 
 
-def speck_fit(network: Network, windows: Windows) -> SpeckFit:
+def speck_fit(network: NetworkSettings, windows: Windows) -> SpeckFit:
     """Lay a network out on the chip."""
     side = -(-windows.cells // 2)
     layers = (

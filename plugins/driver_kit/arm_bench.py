@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.plugins.driver_kit.bench import Bench, wraps_s
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Seen
-from sliplab.rigs.core.arm_settings import BaseArmSettings, Limits
+from sliplab.plugins.driver_kit.bench import DeviceBench, wraps_s
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
+from sliplab.rigs.core.arm_settings import ArmLimits, BaseArmSettings
 from sliplab.rigs.core.capabilities import (
     Arm,
     ArmFault,
@@ -22,7 +22,12 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.driver import ArmDriver, ArmScene
-from sliplab.rigs.core.fake_motion import ControllerClock, Line, StraightMotion, running_clock
+from sliplab.rigs.core.fake_motion import (
+    ControllerClock,
+    StraightMotion,
+    StraightMove,
+    running_clock,
+)
 from sliplab.rigs.core.fakes import HOME, FakeController, Kind
 from sliplab.rigs.core.pose import distance_mm
 
@@ -57,7 +62,7 @@ def no_load(t_s: float) -> Sequence[float]:
     return (0.0,) * 6
 
 
-class ArmBench(Bench):
+class ArmBench(DeviceBench):
     """An arm in the centre of its workspace, which is at rest and not connected yet.
 
     Args:
@@ -94,7 +99,7 @@ class ArmBench(Bench):
     def _make(self, settings: BaseArmSettings, clock_s: float) -> None:
         self.settings, self.limits = settings, settings.limits
         self.host_clock = settings.host_clock
-        self._lines: list[tuple[float, Line]] = []
+        self._lines: list[tuple[float, StraightMove]] = []
         motion = StraightMotion(self.home, lambda line, t_s: self._lines.append((t_s, line)))
         self.clock = running_clock(offset_s=clock_s)
         self.sync_read = False
@@ -104,7 +109,7 @@ class ArmBench(Bench):
         self.fake.start()
         self.arm: Arm = self.driver.build(settings)
 
-    def restart(self, clock_s: float = CLOCK_S, limits: Limits | None = None) -> None:
+    def restart(self, clock_s: float = CLOCK_S, limits: ArmLimits | None = None) -> None:
         """Close device and fake, and make others, whose clock shows another time.
 
         Args:
@@ -215,7 +220,7 @@ class ArmBench(Bench):
             lambda: distance_mm(self.place(), self.home) > BEGUN_MM, self.bounds.call_s
         )
         if not begun:
-            raise Seen(f"the arm had not moved {self.bounds.call_s:g} s after start")
+            raise RuleViolation(f"the arm had not moved {self.bounds.call_s:g} s after start")
         return segment
 
     def end(self, within_s: float) -> Progress:
@@ -227,7 +232,9 @@ class ArmBench(Bench):
             return last[0].done
 
         if not self.until(done, within_s):
-            raise Seen(f"progress was not done {within_s:g} s later, its state {last[0].state}")
+            raise RuleViolation(
+                f"progress was not done {within_s:g} s later, its state {last[0].state}"
+            )
         return last[0]
 
     def arrive(self, segment: Segment) -> Progress:
@@ -266,18 +273,18 @@ class ArmBench(Bench):
     def check_at_rest(self, quiet_s: float) -> None:
         """Raise Seen if the arm moves now, or within a time."""
         if self.moving():
-            raise Seen("the arm was still moving when the call returned")
+            raise RuleViolation("the arm was still moving when the call returned")
         before = self.place()
         self.wait(quiet_s)
         moved = distance_mm(before, self.place())
         if moved > 0.05 or self.moving():
-            raise Seen(f"the arm moved on by {moved:.2f} mm within {quiet_s:g} s")
+            raise RuleViolation(f"the arm moved on by {moved:.2f} mm within {quiet_s:g} s")
 
     def stop(self) -> ArmFault | None:
         """Stop the arm; return the ArmFault of a stop that cannot be confirmed."""
         error = self.refusal("stop", self.arm.stop)
         if error is not None and not isinstance(error, ArmFault):
-            raise Seen(f"stop raised {error!r}, which is no ArmFault") from error
+            raise RuleViolation(f"stop raised {error!r}, which is no ArmFault") from error
         return error
 
     def read_times(self) -> tuple[list[int], list[int]]:
@@ -286,7 +293,7 @@ class ArmBench(Bench):
         return poses.t_ns.tolist(), poses.host_ns.tolist()
 
 
-def _centre(limits: Limits) -> tuple[float, float, float]:
+def _centre(limits: ArmLimits) -> tuple[float, float, float]:
     """Return the centre of the box, in steps of 1/4 mm, which every number format has."""
     middle = (np.array(limits.low_mm) + np.array(limits.high_mm)) / 2
     x, y, z = (np.round(4.0 * middle) / 4.0).tolist()

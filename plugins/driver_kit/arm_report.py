@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.plugins.driver_kit.arm_bench import ArmBench
-from sliplab.plugins.driver_kit.rule import Seen
+from sliplab.plugins.driver_kit.rule import RuleViolation
 from sliplab.rigs.core.capabilities import Pose, Progress, Segment
 from sliplab.rigs.core.pose import F64, angle_deg, distance_mm, segment_seconds
 from sliplab.storage.streams import PoseChunk
@@ -80,7 +80,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Course:
+class TrueMotion:
     """The true motion, n times at steps of `STEP_S`."""
 
     t_s: F64
@@ -95,10 +95,10 @@ class Course:
         return np.array([measure(begin, pose) / whole for pose in self.poses])
 
 
-def true_course(bench: ArmBench, begin_s: float, end_s: float) -> Course:
+def true_course(bench: ArmBench, begin_s: float, end_s: float) -> TrueMotion:
     """Return the true motion between two times of the controller's clock, s."""
     t_s = np.arange(begin_s, end_s, STEP_S)
-    return Course(t_s, [bench.true_pose(at) for at in t_s.tolist()])
+    return TrueMotion(t_s, [bench.true_pose(at) for at in t_s.tolist()])
 
 
 def ask(bench: ArmBench, name: str, work: Callable[[], Any]) -> Answer:
@@ -139,6 +139,8 @@ def follow(bench: ArmBench, *path: Segment) -> Report:
         return report.progress.done
 
     if not bench.until(done, 1.5 * seconds + bench.bounds.news_s):
-        raise Seen(f"progress was not done {bench.bounds.news_s:g} s after the path was due")
+        raise RuleViolation(
+            f"progress was not done {bench.bounds.news_s:g} s after the path was due"
+        )
     report.end_s = bench.clock_s()
     return report

@@ -10,7 +10,7 @@ from functools import partial
 
 from sliplab.plugins.driver_kit.arm_bench import SHORT_MM, ArmBench
 from sliplab.plugins.driver_kit.bench import QUIET_S, check_close, check_methods
-from sliplab.plugins.driver_kit.rule import Rules, Seen
+from sliplab.plugins.driver_kit.rule import Rules, RuleViolation
 from sliplab.rigs.core.capabilities import Arm, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import CLOCK_BACK_S, Kind
 from sliplab.rigs.core.pose import distance_mm
@@ -32,15 +32,15 @@ def _declaration(bench: ArmBench) -> None:
     check_methods(bench.arm, Arm)
     problem = bench.call("ping", lambda: bench.driver.ping(bench.settings), bench.bounds.connect_s)
     if problem is not None:
-        raise Seen(f"ping of a fake that answers returned '{problem}'")
+        raise RuleViolation(f"ping of a fake that answers returned '{problem}'")
     if bench.state() is not ArmState.DISCONNECTED:
-        raise Seen(f"before connect its state was {bench.state()}")
+        raise RuleViolation(f"before connect its state was {bench.state()}")
     bench.connect()
     bench.connect()  # a second one changes nothing
     if bench.state() is not ArmState.READY:
-        raise Seen(f"after connect its state was {bench.state()}")
+        raise RuleViolation(f"after connect its state was {bench.state()}")
     if bench.moving() or distance_mm(bench.home, bench.place()) > ARRIVED_MM:
-        raise Seen("the arm moved when it was connected")
+        raise RuleViolation("the arm moved when it was connected")
 
 
 @RULES.add(
@@ -56,13 +56,17 @@ def _path(bench: ArmBench) -> None:
     progress = bench.end(6 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
     _check_arrived(bench, path[-1].to)
     if len(progress.finished) != len(path):
-        raise Seen(f"{len(progress.finished)} of {len(path)} segments were reported finished")
+        raise RuleViolation(
+            f"{len(progress.finished)} of {len(path)} segments were reported finished"
+        )
     after_ns = bench.now_ns()
     _check_spans(progress.finished, before_ns, after_ns)
     bench.start(bench.to(-SHORT_MM))
     progress = bench.end(2 * SHORT_MM / bench.speed_mm_s + bench.bounds.news_s)
     if len(progress.finished) != 1:
-        raise Seen(f"{len(progress.finished)} segments of the next path, of one, were finished")
+        raise RuleViolation(
+            f"{len(progress.finished)} segments of the next path, of one, were finished"
+        )
 
 
 @RULES.add(
@@ -88,7 +92,7 @@ def _times(bench: ArmBench) -> None:
     bench.end(bench.bounds.news_s)
     read()
     if not times:
-        raise Seen(f"read_poses returned no pose within {TIMES_S:g} s")
+        raise RuleViolation(f"read_poses returned no pose within {TIMES_S:g} s")
     check_order("poses", times)
     check_order("arrivals of poses", arrivals)
     check_order("now_ns", nows)
@@ -114,11 +118,11 @@ def _clock_back(bench: ArmBench) -> None:
     def noticed() -> bool:
         for time_ns in _times_left(bench):
             if time_ns < last_ns - CLOCK_BACK_S * 0.5e9:
-                raise Seen(f"a pose of {time_ns} ns came after one of {last_ns} ns")
+                raise RuleViolation(f"a pose of {time_ns} ns came after one of {last_ns} ns")
         return bench.fault_noticed()
 
     if not bench.until(noticed, bench.bounds.news_s):
-        raise Seen(f"no call reported it within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"no call reported it within {bench.bounds.news_s:g} s")
 
 
 @RULES.add(
@@ -146,9 +150,9 @@ def _limits(bench: ArmBench) -> None:
         bench.wait(QUIET_S)
         moved = distance_mm(bench.home, bench.place())
         if moved > ARRIVED_MM or bench.moving():
-            raise Seen(f"the arm moved {moved:.2f} mm on a path {what}")
+            raise RuleViolation(f"the arm moved {moved:.2f} mm on a path {what}")
         if error is None:
-            raise Seen(f"start took a path {what}")
+            raise RuleViolation(f"start took a path {what}")
 
 
 @RULES.add("one path at a time", "start raises a RigError while the arm moves; the path continues")
@@ -157,7 +161,7 @@ def _one_path(bench: ArmBench) -> None:
     back, path = bench.to(-SHORT_MM), bench.to(4 * SHORT_MM)
     bench.start(path)
     if bench.refusal("start", lambda: bench.arm.start([back])) is None:
-        raise Seen("start took a second path while the arm moved")
+        raise RuleViolation("start took a second path while the arm moved")
     bench.end(bench.bounds.news_s + 4 * SHORT_MM / bench.speed_mm_s)
     _check_arrived(bench, path.to)
 
@@ -169,7 +173,7 @@ def _stop_at_rest(bench: ArmBench) -> None:
     for _ in range(2):
         bench.call("stop", bench.arm.stop)
     if bench.state() is not ArmState.READY:
-        raise Seen(f"after stop its state was {bench.state()}")
+        raise RuleViolation(f"after stop its state was {bench.state()}")
     target = bench.to(SHORT_MM)
     bench.arrive(target)
     bench.call("stop", bench.arm.stop)
@@ -187,10 +191,10 @@ def _stop_moving(bench: ArmBench) -> None:
     bench.call("stop", bench.arm.stop)
     bench.check_at_rest(QUIET_S)
     if distance_mm(bench.place(), segment.to) < ARRIVED_MM:
-        raise Seen("the arm went on to the end of the path")
+        raise RuleViolation("the arm went on to the end of the path")
     progress = bench.end(bench.bounds.news_s)
     if progress.finished:
-        raise Seen("the stopped segment was reported finished")
+        raise RuleViolation("the stopped segment was reported finished")
     bench.call("a second stop", bench.arm.stop)
     target = bench.to(-SHORT_MM)
     bench.arrive(target)
@@ -215,15 +219,15 @@ def _protective(bench: ArmBench) -> None:
     _check_aborted(bench)
     state = bench.state()  # one that only loses its connection is lost
     if state.healthy or state is ArmState.EMERGENCY_STOP:
-        raise Seen(f"in a protective stop its state was {state}")
+        raise RuleViolation(f"in a protective stop its state was {state}")
     with suppress(RigError):
         if (said := bench.call("progress", bench.arm.progress).state).healthy:
-            raise Seen(f"in a protective stop the state of its progress was {said}")
+            raise RuleViolation(f"in a protective stop the state of its progress was {said}")
     for _ in range(2):
         bench.stop()
     bench.until(lambda: not bench.moving(), bench.bounds.call_s)
     if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
-        raise Seen("start took a path during a protective stop")
+        raise RuleViolation("start took a path during a protective stop")
     bench.check_at_rest(QUIET_S)
 
 
@@ -237,9 +241,9 @@ def _ended_by(bench: ArmBench, kind: Kind) -> None:
         return
     _check_noticed(bench)
     if (state := bench.state()).healthy or state is ArmState.PROTECTIVE_STOP:
-        raise Seen(f"after the fault '{kind.value}' its state was {state}")
+        raise RuleViolation(f"after the fault '{kind.value}' its state was {state}")
     if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
-        raise Seen(f"start took a path after the fault '{kind.value}'")
+        raise RuleViolation(f"start took a path after the fault '{kind.value}'")
     bench.check_at_rest(QUIET_S)
 
 
@@ -289,7 +293,7 @@ def _silent_path(bench: ArmBench) -> None:
 def _silent_connect(bench: ArmBench) -> None:
     bench.inject(Kind.SILENCE)
     if bench.refusal("connect", bench.open, bench.bounds.connect_s) is None:
-        raise Seen("connect returned as if the controller had answered")
+        raise RuleViolation("connect returned as if the controller had answered")
     bench.stop()
     bench.refusal("close", bench.arm.close)
 
@@ -305,9 +309,9 @@ def _unplugged(bench: ArmBench) -> None:
     bench.inject(Kind.LINK_CUT)
     _check_noticed(bench)
     if bench.refusal("start", lambda: bench.arm.start([target])) is None:
-        raise Seen("start took a path without a connection")
+        raise RuleViolation("start took a path without a connection")
     if bench.refusal("connect", bench.open, bench.bounds.connect_s) is None:
-        raise Seen("connect returned without a connection")
+        raise RuleViolation("connect returned without a connection")
     bench.stop()
     bench.refusal("close", bench.arm.close)
     bench.restore()
@@ -319,7 +323,7 @@ def _unplugged(bench: ArmBench) -> None:
     if not reconnected:
         bench.connect()
     if bench.state() is not ArmState.READY:
-        raise Seen(f"after it was plugged in and connected its state was {bench.state()}")
+        raise RuleViolation(f"after it was plugged in and connected its state was {bench.state()}")
 
 
 @RULES.add(
@@ -369,9 +373,9 @@ def _close(bench: ArmBench) -> None:
     bench.call("close", bench.arm.close)
     bench.call("stop after close", bench.arm.stop)
     if bench.state() is not ArmState.DISCONNECTED:
-        raise Seen(f"after close its state was {bench.state()}")
+        raise RuleViolation(f"after close its state was {bench.state()}")
     if bench.refusal("start", lambda: bench.arm.start([_home(bench)])) is None:
-        raise Seen("start took a path after close")
+        raise RuleViolation("start took a path after close")
     check_close(bench)
 
 
@@ -382,7 +386,7 @@ def check_order(what: str, times: list[int]) -> None:
     """Raise Seen if times, ns, fall back."""
     for before, after in itertools.pairwise(times):
         if after < before:
-            raise Seen(f"{what}: {after} ns came after {before} ns")
+            raise RuleViolation(f"{what}: {after} ns came after {before} ns")
 
 
 def _home(bench: ArmBench) -> Segment:
@@ -399,7 +403,7 @@ def _times_left(bench: ArmBench) -> list[int]:
 def _check_arrived(bench: ArmBench, target: Pose) -> None:
     off = distance_mm(bench.place(), target)
     if off > ARRIVED_MM:
-        raise Seen(f"progress was done {off:.2f} mm before the end of the path")
+        raise RuleViolation(f"progress was done {off:.2f} mm before the end of the path")
 
 
 def _check_spans(spans: tuple[tuple[int, int], ...], before_ns: int, after_ns: int) -> None:
@@ -408,12 +412,12 @@ def _check_spans(spans: tuple[tuple[int, int], ...], before_ns: int, after_ns: i
     for number, (begin_ns, end_ns) in enumerate(spans, 1):
         if begin_ns < last_ns - slack_ns:
             early = "the path was started" if number == 1 else "the one before it ended"
-            raise Seen(
+            raise RuleViolation(
                 f"segment {number} was reported to begin {(last_ns - begin_ns) / 1e9:.3f} s before "
                 f"{early}"
             )
         if not begin_ns <= end_ns <= after_ns + slack_ns:
-            raise Seen(
+            raise RuleViolation(
                 f"segment {number} was reported from {begin_ns} to {end_ns} ns, at {after_ns} ns"
             )
         last_ns = end_ns
@@ -428,17 +432,17 @@ def _path_over(bench: ArmBench) -> bool:
 
 def _check_noticed(bench: ArmBench) -> None:
     if not bench.until(bench.fault_noticed, bench.bounds.news_s):
-        raise Seen(f"no call reported it within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"no call reported it within {bench.bounds.news_s:g} s")
 
 
 def _check_aborted(bench: ArmBench) -> None:
     """Raise Seen if a path that a fault ended is not reported so."""
     _check_noticed(bench)
     if not bench.until(lambda: _path_over(bench), bench.bounds.news_s):
-        raise Seen(f"progress was not done {bench.bounds.news_s:g} s after the fault")
+        raise RuleViolation(f"progress was not done {bench.bounds.news_s:g} s after the fault")
     try:
         finished = bench.call("progress", bench.arm.progress).finished
     except RigError:
         return
     if finished:
-        raise Seen("the segment that the fault ended was reported finished")
+        raise RuleViolation("the segment that the fault ended was reported finished")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Self, TypeVar
 
-from sliplab.plugins.driver_kit.rule import Bounds, Seen
+from sliplab.plugins.driver_kit.rule import Bounds, RuleViolation
 from sliplab.rigs.core.capabilities import RigError
 
 T = TypeVar("T")
@@ -60,7 +60,7 @@ def settle() -> None:
         before = now
 
 
-class Bench(ABC):
+class DeviceBench(ABC):
     """A device on its fake; a context manager that closes both.
 
     Args:
@@ -77,7 +77,7 @@ class Bench(ABC):
         return self
 
     def __exit__(self, *error: object) -> None:
-        with suppress(Seen, RigError):
+        with suppress(RuleViolation, RigError):
             self.call("close", self.close_device, self.bounds.call_s)
         self.close_fake()
 
@@ -131,12 +131,12 @@ class Bench(ABC):
         thread.start()
         thread.join(limit_s)
         if thread.is_alive():
-            raise Seen(f"{name} had not returned after {limit_s:g} s")
+            raise RuleViolation(f"{name} had not returned after {limit_s:g} s")
         if not errors:
             return results[0]
-        if isinstance(errors[0], (RigError, Seen)):
+        if isinstance(errors[0], (RigError, RuleViolation)):
             raise errors[0]
-        raise Seen(f"{name} raised {errors[0]!r}, which is no RigError") from errors[0]
+        raise RuleViolation(f"{name} raised {errors[0]!r}, which is no RigError") from errors[0]
 
     def refusal(
         self, name: str, work: Callable[[], object], within_s: float | None = None
@@ -163,10 +163,10 @@ def check_methods(device: object, capability: type) -> None:
     wanted = {*vars(capability), *capability.__annotations__}
     missing = sorted(n for n in wanted if not n.startswith("_") and not hasattr(device, n))
     if missing:
-        raise Seen(f"it has no {', '.join(missing)}")
+        raise RuleViolation(f"it has no {', '.join(missing)}")
 
 
-def check_close(bench: Bench) -> None:
+def check_close(bench: DeviceBench) -> None:
     """Open and close the device twice, and close the fake; nothing may be left of either.
 
     Raises:
@@ -177,7 +177,7 @@ def check_close(bench: Bench) -> None:
         bench.call("close", bench.close_device)
         error = bench.refusal("a second close", bench.close_device)
         if error is not None:
-            raise Seen(f"a second close raised {error!r}")
+            raise RuleViolation(f"a second close raised {error!r}")
     bench.close_fake()
     if not bench.until(lambda: not bench.left_open(), SETTLE_S):
-        raise Seen(f"after close {bench.left_open()} stayed open")
+        raise RuleViolation(f"after close {bench.left_open()} stayed open")

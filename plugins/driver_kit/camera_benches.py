@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.plugins.driver_kit.bench import wraps_s
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Seen
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
 from sliplab.plugins.driver_kit.stream_bench import StreamBench
 from sliplab.rigs.core.capabilities import EventCamera, FrameCamera
 from sliplab.rigs.core.driver import EventCameraDriver, FrameCameraDriver
@@ -88,12 +88,12 @@ class EventBench(StreamBench):
         super().check_content()
         found = [pulse for pulse in self.pulses if pulse >= (self._mark or 0) * 1000]
         if found != self.fed_pulses:
-            raise Seen(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
+            raise RuleViolation(f"{len(self.fed_pulses)} pulses were sent and {len(found)} came")
 
     def check_fresh(self, mark: int) -> None:
         """Raise Seen if a pulse came from before a time, us."""
         if min(self.pulses) < mark * 1000:
-            raise Seen("the second run began with pulses of the first one")
+            raise RuleViolation("the second run began with pulses of the first one")
 
     def forget(self) -> None:
         """Forget what was fed and what came."""
@@ -107,7 +107,7 @@ class EventBench(StreamBench):
         self.quiet()
         sent, found = np.diff(self.fed_pulses), np.diff(self.pulses)
         if sent.tolist() != found.tolist():
-            raise Seen(f"pulses {sent.tolist()} ns apart came {found.tolist()} ns apart")
+            raise RuleViolation(f"pulses {sent.tolist()} ns apart came {found.tolist()} ns apart")
 
     def silence(self) -> None:
         """Stall the fake."""
@@ -177,7 +177,7 @@ class FrameBench(StreamBench):
             raise NotTried("it reports no level of the sync line: none is wired to it")
         wrong = [number for number, level in found.items() if level != sent[number]]
         if wrong:
-            raise Seen(
+            raise RuleViolation(
                 f"frame {wrong[0]} was exposed at level {sent[wrong[0]]} of the sync line, and "
                 f"came with {found[wrong[0]]}"
             )

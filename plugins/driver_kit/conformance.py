@@ -26,7 +26,7 @@ from sliplab.plugins.driver_kit.arm_bench import ArmBench
 from sliplab.plugins.driver_kit.bench import settle
 from sliplab.plugins.driver_kit.camera_benches import EventBench, FrameBench
 from sliplab.plugins.driver_kit.gripper_bench import GripperBench
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, Rules, Seen
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, Rules, RuleViolation
 from sliplab.plugins.driver_kit.sensor_benches import ArmForceBench, ForceBench, SyncBench
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings
@@ -65,7 +65,7 @@ class Case:
 
     def _warm(self) -> None:
         """Open and close a device, forget it, and wait for threads that are ending."""
-        with self.make() as bench, suppress(Seen):  # the rule itself will see it, too
+        with self.make() as bench, suppress(RuleViolation):  # the rule itself will see it, too
             bench.refusal("connect", bench.open, bench.bounds.connect_s)
         del bench
         gc.collect()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.plugins.driver_kit.bench import Bench
+from sliplab.plugins.driver_kit.bench import DeviceBench
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried
 from sliplab.rigs.core.capabilities import Gripper, GripperState
 from sliplab.rigs.core.driver import GripperDriver, GripperScene
@@ -17,7 +17,7 @@ REACTION_NS = 8_000_000
 ACCELERATION_MM_S2 = 1000.0
 
 
-class GripperBench(Bench):
+class GripperBench(DeviceBench):
     """A gripper that begins at the opening of its settings, in real time."""
 
     def __init__(self, driver: GripperDriver[Any], settings: Any, bounds: Bounds) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sliplab.plugins.driver_kit.bench import POLL_S, QUIET_S, check_close, check_methods
 from sliplab.plugins.driver_kit.gripper_bench import GripperBench
-from sliplab.plugins.driver_kit.rule import Rules, Seen
+from sliplab.plugins.driver_kit.rule import Rules, RuleViolation
 from sliplab.rigs.core.capabilities import Gripper, GripperState
 
 RULES = Rules[GripperBench]()
@@ -34,7 +34,7 @@ def _declaration(bench: GripperBench) -> None:
     check_methods(bench.device, Gripper)
     problem = bench.call("ping", lambda: bench.driver.ping(bench.settings), bench.bounds.connect_s)
     if problem is not None:
-        raise Seen(f"ping of a fake that answers returned '{problem}'")
+        raise RuleViolation(f"ping of a fake that answers returned '{problem}'")
 
 
 @RULES.add(
@@ -49,16 +49,18 @@ def _move(bench: GripperBench) -> None:
     began = time.monotonic()
     bench.move(wanted, slow)
     if time.monotonic() - began > CLOSED_MM / slow / 2:
-        raise Seen("move returned when the fingers were half way or further")
+        raise RuleViolation("move returned when the fingers were half way or further")
     if not bench.state().moving:
-        raise Seen("state reported no motion right after the move")
+        raise RuleViolation("state reported no motion right after the move")
     if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-        raise Seen(f"state still reported motion after {bench.bounds.call_s:g} s")
+        raise RuleViolation(f"state still reported motion after {bench.bounds.call_s:g} s")
     reached, true_mm = bench.state().opening_mm, bench.fingers.target_mm
     if not wanted - EPS_MM <= true_mm <= wanted + bench.range.step_mm + EPS_MM:
-        raise Seen(f"requested {wanted:g} mm, the fingers went to {true_mm:g} mm")
+        raise RuleViolation(f"requested {wanted:g} mm, the fingers went to {true_mm:g} mm")
     if abs(reached - true_mm) > bench.range.step_mm + EPS_MM:
-        raise Seen(f"state reported {reached:g} mm, and the fingers were at {true_mm:g} mm")
+        raise RuleViolation(
+            f"state reported {reached:g} mm, and the fingers were at {true_mm:g} mm"
+        )
 
 
 @RULES.add(
@@ -76,20 +78,22 @@ def _values(bench: GripperBench) -> None:
         from_mm, began_ns = bench.true_mm(time.monotonic_ns())[0], time.monotonic_ns()
         bench.move(wanted, speed, force)
         if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-            raise Seen(f"state still reported motion after {bench.bounds.call_s:g} s")
+            raise RuleViolation(f"state still reported motion after {bench.bounds.call_s:g} s")
         if bench.moving():
-            raise Seen("state reported no motion while the fingers moved")
+            raise RuleViolation("state reported no motion while the fingers moved")
         (to_mm,) = bench.true_mm(time.monotonic_ns())
         if not wanted - EPS_MM <= to_mm <= wanted + bench.range.step_mm + EPS_MM:
-            raise Seen(f"requested {wanted:g} mm from {from_mm:g} mm, the fingers are at {to_mm:g}")
+            raise RuleViolation(
+                f"requested {wanted:g} mm from {from_mm:g} mm, the fingers are at {to_mm:g}"
+            )
         reached = _speed_mm_s(bench, began_ns, from_mm, to_mm)
         if not abs(reached - speed) <= SHARE * speed:
-            raise Seen(f"requested {speed:g} mm/s, the fingers went at {reached:.1f} mm/s")
+            raise RuleViolation(f"requested {speed:g} mm/s, the fingers went at {reached:.1f} mm/s")
         sent_n = bench.fingers.last_force_n
         if not (1.0 - SHARE) * force <= sent_n <= force + EPS_MM:
-            raise Seen(f"requested {force:g} N, the gripper was sent {sent_n:g} N")
+            raise RuleViolation(f"requested {force:g} N, the gripper was sent {sent_n:g} N")
         if bench.state().stalled:
-            raise Seen("state reported a stall, though no object was there")
+            raise RuleViolation("state reported a stall, though no object was there")
 
 
 @RULES.add(
@@ -100,7 +104,9 @@ def _values(bench: GripperBench) -> None:
 def _state_moving(bench: GripperBench) -> None:
     bench.connect()
     if bench.device.range != bench.range:
-        raise Seen(f"its range was {bench.device.range}, the driver declares {bench.range}")
+        raise RuleViolation(
+            f"its range was {bench.device.range}, the driver declares {bench.range}"
+        )
     for wanted in (bench.opening_mm - CLOSED_MM, bench.opening_mm):
         bench.move(wanted, bench.range.speed_mm_s[0])
         bench.until(bench.moving, QUIET_S)
@@ -115,9 +121,9 @@ def _state_moving(bench: GripperBench) -> None:
             _check_state(bench, state, begun_ns, ended_ns)
             bench.wait(POLL_S)
         if not took:
-            raise Seen("state had not returned before the fingers were at rest")
+            raise RuleViolation("state had not returned before the fingers were at rest")
         if min(took) > AT_ONCE_S:
-            raise Seen(f"state took {min(took):.2f} s or more while the fingers moved")
+            raise RuleViolation(f"state took {min(took):.2f} s or more while the fingers moved")
         bench.until(lambda: not bench.state().moving, bench.bounds.call_s)
 
 
@@ -130,9 +136,9 @@ def _stay(bench: GripperBench) -> None:
     bench.wait(QUIET_S)
     (after,) = bench.true_mm(time.monotonic_ns())
     if bench.moving() or abs(after - before) > EPS_MM:
-        raise Seen(f"the fingers went from {before:g} to {after:g} mm")
+        raise RuleViolation(f"the fingers went from {before:g} to {after:g} mm")
     if bench.refusal("state", bench.device.state) is None:
-        raise Seen("state returned after close")
+        raise RuleViolation("state returned after close")
 
 
 @RULES.add("range", "a value out of range is refused, and nothing moves")
@@ -144,10 +150,10 @@ def _range(bench: GripperBench) -> None:
         for wrong in (low - 1.0, high + 1.0, float("nan")):
             given = [*good[:place], wrong, *good[place + 1 :]]
             if bench.refusal("move", lambda given=given: bench.device.move(*given)) is None:  # type: ignore[misc]
-                raise Seen(f"move{tuple(given)} was accepted")
+                raise RuleViolation(f"move{tuple(given)} was accepted")
     bench.wait(QUIET_S)
     if bench.fingers.target_mm != bench.opening_mm:
-        raise Seen("the fingers moved all the same")
+        raise RuleViolation("the fingers moved all the same")
 
 
 @RULES.add(
@@ -163,13 +169,13 @@ def _stop(bench: GripperBench) -> None:
         bench.call("stop", bench.device.stop)
     (stopped_mm,) = bench.true_mm(time.monotonic_ns())
     if not bench.until(lambda: not bench.state().moving, bench.bounds.call_s):
-        raise Seen("state reported motion after the stop")
+        raise RuleViolation("state reported motion after the stop")
     if not bench.until(lambda: not bench.fingers.moving(time.monotonic_ns()), bench.bounds.call_s):
-        raise Seen("the fingers moved on")
+        raise RuleViolation("the fingers moved on")
     if abs(bench.fingers.target_mm - (bench.opening_mm - CLOSED_MM)) < 1.0:
-        raise Seen("the fingers went to the end of their move")
+        raise RuleViolation("the fingers went to the end of their move")
     if bench.fingers.target_mm > stopped_mm + bench.range.step_mm + EPS_MM:
-        raise Seen(f"the fingers opened to {bench.fingers.target_mm:g} mm after the stop")
+        raise RuleViolation(f"the fingers opened to {bench.fingers.target_mm:g} mm after the stop")
 
 
 @RULES.add("stall", "fingers that an object stops are reported as stalled, not as moving")
@@ -184,10 +190,10 @@ def _stall(bench: GripperBench) -> None:
         return state.stalled and not state.moving
 
     if not bench.until(stalled, bench.bounds.news_s):
-        raise Seen(f"state reported {bench.state()}")
+        raise RuleViolation(f"state reported {bench.state()}")
     bench.move(bench.opening_mm)
     if bench.state().stalled:
-        raise Seen("state reported a stall in the next move")
+        raise RuleViolation("state reported a stall in the next move")
 
 
 @RULES.add("fault of the gripper", "a fault that the gripper reports is a RigError of `state`")
@@ -199,7 +205,7 @@ def _fault(bench: GripperBench) -> None:
         return bench.refusal("state", bench.device.state) is not None
 
     if not bench.until(reported, bench.bounds.news_s):
-        raise Seen(f"state did not report it within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"state did not report it within {bench.bounds.news_s:g} s")
 
 
 @RULES.add(
@@ -217,9 +223,11 @@ def _silent(bench: GripperBench) -> None:
         bench.refusal("stop", bench.device.stop)
         took_s = time.monotonic() - began
         if waited and waiting.done() and took_s > AT_ONCE_S:
-            raise Seen(f"stop took {took_s:.2f} s: it waited for the answer to another call")
+            raise RuleViolation(
+                f"stop took {took_s:.2f} s: it waited for the answer to another call"
+            )
     if bench.refusal("state", waiting.result) is None:
-        raise Seen("state returned though nothing answers")
+        raise RuleViolation("state returned though nothing answers")
     bench.refusal("close", bench.close_device)
 
 
@@ -229,7 +237,7 @@ def _silent(bench: GripperBench) -> None:
 def _absent(bench: GripperBench) -> None:
     bench.fake.silence()
     if bench.refusal("connect", bench.open, bench.bounds.connect_s) is None:
-        raise Seen("connect returned though nothing answers")
+        raise RuleViolation("connect returned though nothing answers")
 
 
 @RULES.add("unplugged gripper", "an unplugged gripper is reported; stop and close return")
@@ -237,7 +245,7 @@ def _unplugged(bench: GripperBench) -> None:
     bench.connect()
     bench.fake.close()
     if bench.refusal("state", bench.device.state) is None:
-        raise Seen("state returned though it is unplugged")
+        raise RuleViolation("state returned though it is unplugged")
     bench.refusal("stop", bench.device.stop)
     bench.refusal("close", bench.close_device)
 
@@ -265,8 +273,10 @@ def _speed_mm_s(bench: GripperBench, began_ns: int, from_mm: float, to_mm: float
 
 def _check_state(bench: GripperBench, state: GripperState, begun_ns: int, ended_ns: int) -> None:
     if not state.moving or state.stalled:
-        raise Seen(f"while the fingers moved it reported {state}")
+        raise RuleViolation(f"while the fingers moved it reported {state}")
     true = bench.true_mm(begun_ns - round(LAG_S * 1e9), begun_ns, ended_ns)
     step = bench.range.step_mm + EPS_MM
     if not min(true) - step <= state.opening_mm <= max(true) + step:
-        raise Seen(f"state reported {state.opening_mm:g} mm, the fingers were at {true[-1]:.2f} mm")
+        raise RuleViolation(
+            f"state reported {state.opening_mm:g} mm, the fingers were at {true[-1]:.2f} mm"
+        )

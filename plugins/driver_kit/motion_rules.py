@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from sliplab.plugins.driver_kit.arm_bench import PULSE_EVERY_S, PULSE_S, ArmBench, pulse_s
 from sliplab.plugins.driver_kit.arm_report import (
     STEP_S,
-    Course,
     Report,
+    TrueMotion,
     ask,
     clock_offset_ns,
     follow,
@@ -26,8 +26,8 @@ from sliplab.plugins.driver_kit.arm_report import (
 )
 from sliplab.plugins.driver_kit.arm_rules import ARRIVED_MM, CLOCK_S, check_order
 from sliplab.plugins.driver_kit.bench import QUIET_S
-from sliplab.plugins.driver_kit.rule import NotTried, Rules, Seen
-from sliplab.rigs.core.arm_settings import Limits, PlaneSettings
+from sliplab.plugins.driver_kit.rule import NotTried, Rules, RuleViolation
+from sliplab.rigs.core.arm_settings import ArmLimits, PlaneSettings
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment, StoppingArm
 from sliplab.rigs.core.pose import F64, angle_deg, distance_mm
 
@@ -78,7 +78,7 @@ def _speed(bench: ArmBench) -> None:
     path = _corner(bench)
     report = follow(bench, *path)
     if not report.chunks and not report.progress.finished:
-        raise Seen("neither poses nor finished segments were reported")
+        raise RuleViolation("neither poses nor finished segments were reported")
     course = true_course(bench, report.begin_s, report.end_s)
     begin, since = report.before, 0
     for number, segment in enumerate(path, 1):
@@ -100,14 +100,16 @@ def _turn(bench: ArmBench) -> None:
     segment = Segment(_turned(bench, bench.place()), bench.speed_mm_s, TURN_DEG_S)
     if not bench.twists:
         if bench.refusal("start", lambda: bench.arm.start([segment])) is None:
-            raise Seen("start took a turn, though the driver declares that it does not twist")
+            raise RuleViolation(
+                "start took a turn, though the driver declares that it does not twist"
+            )
         bench.check_at_rest(QUIET_S)
         return
     report = follow(bench, segment)
     course = true_course(bench, report.begin_s, report.end_s)
     away = max(distance_mm(report.before, pose) for pose in course.poses)
     if away > OFF_SPOT_MM:
-        raise Seen(f"the tool centre point moved by {away:.2f} mm in a turn on the spot")
+        raise RuleViolation(f"the tool centre point moved by {away:.2f} mm in a turn on the spot")
     _check_oriented(bench, segment.to)
     _check_segment(report, course, 1, report.before, segment, 0)
 
@@ -148,7 +150,7 @@ def _poses(bench: ArmBench) -> None:
         if not _nearest_mm(bench, answer.value, answer.begin_s - lag_s, answer.end_s) <= OFF_LINE_MM
     ]
     if len(wrong) > STALE_SHARE * len(answers):
-        raise Seen(
+        raise RuleViolation(
             f"pose returned {_xyz(wrong[0].value)} mm, the arm was at "
             f"{_xyz(bench.true_pose(wrong[0].end_s))} mm and not there in the {lag_s:g} s before"
         )
@@ -161,7 +163,9 @@ def _poses(bench: ArmBench) -> None:
     _check_samples(bench, report)
     at_rest = ask(bench, "pose", bench.arm.pose).value
     if not distance_mm(at_rest, bench.place()) <= ARRIVED_MM:
-        raise Seen(f"at rest at {_xyz(bench.place())} mm, pose returned {_xyz(at_rest)} mm")
+        raise RuleViolation(
+            f"at rest at {_xyz(bench.place())} mm, pose returned {_xyz(at_rest)} mm"
+        )
 
 
 @RULES.add(
@@ -177,23 +181,27 @@ def _calls(bench: ArmBench) -> None:
     assert report.start is not None
     done = np.interp(report.start.end_s, course.t_s, course.shares(report.before, segment))
     if done > 0.5:
-        raise Seen(f"start returned after {done:.0%} of the way")
+        raise RuleViolation(f"start returned after {done:.0%} of the way")
     for name in ("state", "pose", "progress", "read_poses"):
         while_moving = [answer.seconds for answer in report.of(name) if answer.moving]
         if not while_moving:
-            raise Seen(f"{name} had not returned before the arm was at rest")
+            raise RuleViolation(f"{name} had not returned before the arm was at rest")
         if min(while_moving) > AT_ONCE_S:
-            raise Seen(f"{name} took {min(while_moving):.2f} s or more while the arm moved")
+            raise RuleViolation(
+                f"{name} took {min(while_moving):.2f} s or more while the arm moved"
+            )
     for answer in report.of("state"):
         if answer.moving and answer.value is not ArmState.MOVING:
-            raise Seen(f"while the arm moved its state was {answer.value}")
+            raise RuleViolation(f"while the arm moved its state was {answer.value}")
     for answer in report.of("progress"):
         if answer.moving and answer.value.done:
-            raise Seen("progress was done while the arm moved")
+            raise RuleViolation("progress was done while the arm moved")
         if answer.moving and answer.value.state is not ArmState.MOVING:
-            raise Seen(f"while the arm moved the state of its progress was {answer.value.state}")
+            raise RuleViolation(
+                f"while the arm moved the state of its progress was {answer.value.state}"
+            )
     if bench.state() is not ArmState.READY:
-        raise Seen(f"after the path its state was {bench.state()}")
+        raise RuleViolation(f"after the path its state was {bench.state()}")
 
 
 @RULES.add(
@@ -213,7 +221,7 @@ def _clock(bench: ArmBench) -> None:
         for t_ns in times:
             at_s = (t_ns - offset_ns) / 1e9
             if not since_s - STALL_S <= at_s <= read_s + CLOCK_S:
-                raise Seen(
+                raise RuleViolation(
                     f"a pose of {t_ns} ns came when now_ns was about "
                     f"{round(read_s * 1e9) + offset_ns} ns"
                 )
@@ -224,9 +232,11 @@ def _clock(bench: ArmBench) -> None:
     passed_s = bench.clock_s() - begin_s
     went_s = (clock_offset_ns(bench) - offset_ns) / 1e9 + passed_s
     if not abs(went_s - passed_s) <= SHARE * passed_s:
-        raise Seen(f"now_ns went on by {went_s:.3f} s in {passed_s:.3f} s of the controller")
+        raise RuleViolation(
+            f"now_ns went on by {went_s:.3f} s in {passed_s:.3f} s of the controller"
+        )
     if not delays_s or not min(delays_s) <= LAG_S + CLOCK_S:
-        raise Seen(f"no pose came within {LAG_S + CLOCK_S:.2f} s of its time")
+        raise RuleViolation(f"no pose came within {LAG_S + CLOCK_S:.2f} s of its time")
 
 
 @RULES.add(
@@ -250,11 +260,15 @@ def _host_times(bench: ArmBench) -> None:
         if arrivals:
             ages_s.append((now_ns - arrivals[-1]) / 1e9)
     if not ages_s:
-        raise Seen("read_poses returned no poses")
+        raise RuleViolation("read_poses returned no poses")
     if not apart:
-        raise Seen("host_ns of all poses of a read was the same, though they came one by one")
+        raise RuleViolation(
+            "host_ns of all poses of a read was the same, though they came one by one"
+        )
     if np.median(ages_s) > LAG_S:
-        raise Seen(f"host_ns of the newest pose was {np.median(ages_s):.2f} s old when it was read")
+        raise RuleViolation(
+            f"host_ns of the newest pose was {np.median(ages_s):.2f} s old when it was read"
+        )
     bench.start(bench.to(0.25 * _long_mm(bench)))
     bench.end(bench.bounds.news_s + 1.0)
     check_arrivals(bench.read_times()[1], now_ns - stall_ns, bench.host_ns())
@@ -301,18 +315,18 @@ def _sync_input(bench: ArmBench) -> None:
         nearest = int(np.abs(edges_s + 0.5 * PULSE_S - at_s).argmin())
         # a busy computer sees an edge late, while the level is still high
         if not -EDGE_S <= at_s - edges_s[nearest] <= PULSE_S - EDGE_S:
-            raise Seen(
+            raise RuleViolation(
                 f"a pulse was reported {at_s - edges_s[nearest]:+.3f} s from the nearest rising "
                 f"edge; pulses last {PULSE_S:g} s"
             )
         if nearest in seen:
-            raise Seen(f"the pulse of {t_ns} ns was read twice")
+            raise RuleViolation(f"the pulse of {t_ns} ns was read twice")
         seen.add(nearest)
         least_s = min(least_s, abs(at_s - edges_s[nearest]))
     if least_s > EDGE_S:
-        raise Seen(f"each pulse was reported {least_s:.3f} s or more from its rising edge")
+        raise RuleViolation(f"each pulse was reported {least_s:.3f} s or more from its rising edge")
     if len(seen) < PULSES // 2:
-        raise Seen(f"{len(seen)} of about {PULSES} pulses were reported")
+        raise RuleViolation(f"{len(seen)} of about {PULSES} pulses were reported")
 
 
 @RULES.add("close while moving", "close of an arm that moves stops it before it returns")
@@ -323,7 +337,7 @@ def _close_moving(bench: ArmBench) -> None:
     bench.until(lambda: not bench.moving(), QUIET_S)  # a controller stops when its client is gone
     bench.check_at_rest(QUIET_S)
     if distance_mm(bench.place(), segment.to) < ARRIVED_MM:
-        raise Seen("the arm went on to the end of the path")
+        raise RuleViolation("the arm went on to the end of the path")
 
 
 @RULES.add(
@@ -367,7 +381,7 @@ def _turn_and_depth(bench: ArmBench) -> None:
         error = bench.refusal("start", lambda path=path: bench.arm.start(path))  # type: ignore[misc]
         moved = max(distance_mm(bench.home, bench.place()), angle_deg(bench.home, bench.place()))
         if error is None or moved > ARRIVED_MM or bench.moving():
-            raise Seen(f"start took a path {what}")
+            raise RuleViolation(f"start took a path {what}")
     bench.check_at_rest(QUIET_S)
 
 
@@ -379,7 +393,7 @@ def check_arrivals(arrivals: list[int], since_ns: int, now_ns: int) -> None:
     check_order("arrivals", arrivals)
     for host_ns in arrivals:
         if not since_ns <= host_ns <= now_ns:
-            raise Seen(
+            raise RuleViolation(
                 f"host_ns was {host_ns}, received between {since_ns} and {now_ns} ns of the host's "
                 "monotonic clock"
             )
@@ -422,7 +436,7 @@ def _turned(bench: ArmBench, pose: Pose, degrees: float | None = None) -> Pose:
     return Pose(pose.xyz_mm, (a, b, c))
 
 
-def _with(limits: Limits, **changes: Any) -> Limits:
+def _with(limits: ArmLimits, **changes: Any) -> ArmLimits:
     return limits.model_copy(update=changes)
 
 
@@ -442,7 +456,7 @@ def _nearest_mm(bench: ArmBench, pose: Pose, begin_s: float, end_s: float) -> fl
 
 
 def _check_segment(
-    report: Report, course: Course, number: int, begin: Pose, segment: Segment, since: int
+    report: Report, course: TrueMotion, number: int, begin: Pose, segment: Segment, since: int
 ) -> tuple[Pose, int]:
     """Check the true motion in a segment; return its end, and the row at which it was reached."""
     turns = segment.turn_deg_s is not None
@@ -452,7 +466,7 @@ def _check_segment(
     left = np.array([measure(pose, segment.to) for pose in course.poses[since:]])
     reached = np.flatnonzero(left <= near)
     if not len(reached):
-        raise Seen(
+        raise RuleViolation(
             f"the arm came no nearer to the end of segment {number}, {whole:.1f} {unit} away, than "
             f"{left.min():.2f} {unit}"
         )
@@ -460,13 +474,13 @@ def _check_segment(
     poses = course.poses[since : end + 1]
     way = sum(measure(a, b) for a, b in itertools.pairwise(poses)) + float(left[reached[0]])
     if not abs(way - whole) <= SHARE * whole:
-        raise Seen(f"segment {number} of {whole:.1f} {unit} was a way of {way:.1f} {unit}")
+        raise RuleViolation(f"segment {number} of {whole:.1f} {unit} was a way of {way:.1f} {unit}")
     if not turns and (off := _off_line_mm(begin, segment.to, poses)) > OFF_LINE_MM:
-        raise Seen(f"the arm left the straight line of segment {number} by {off:.2f} mm")
-    shares = Course(course.t_s[since : end + 1], poses).shares(begin, segment)
+        raise RuleViolation(f"the arm left the straight line of segment {number} by {off:.2f} mm")
+    shares = TrueMotion(course.t_s[since : end + 1], poses).shares(begin, segment)
     for speed, share in zip(_speeds(shares, whole), (SHARE, MEAN_SHARE), strict=True):
         if not abs(speed - asked) <= share * asked:
-            raise Seen(
+            raise RuleViolation(
                 f"segment {number} was followed at {speed:.1f} {unit}/s instead of {asked:g} "
                 f"{unit}/s"
             )
@@ -488,12 +502,12 @@ def _speeds(shares: F64, whole: float) -> tuple[float, float]:
 def _check_span(report: Report, number: int, begin_s: float, end_s: float) -> None:
     """Check the reported times of a segment against those of its true motion."""
     if len(report.progress.finished) < number:
-        raise Seen(f"segment {number} was not reported finished")
+        raise RuleViolation(f"segment {number} was not reported finished")
     spans = report.progress.finished[number - 1]
     for what, t_ns, true_s in zip(("begin", "end"), spans, (begin_s, end_s), strict=True):
         off_s = report.true_s(t_ns) - true_s
         if not abs(off_s) <= SPAN_S:
-            raise Seen(
+            raise RuleViolation(
                 f"segment {number} was reported to {what} {off_s:+.3f} s from when it did, on the "
                 "controller's clock"
             )
@@ -510,7 +524,7 @@ def _check_oriented(bench: ArmBench, to: Pose) -> None:
     """Check at rest the true orientation, and those that the driver reports."""
     off = angle_deg(bench.place(), to)
     if not off <= ORIENTED_DEG:
-        raise Seen(f"the orientation was {off:.2f} deg from {_deg(to)} deg")
+        raise RuleViolation(f"the orientation was {off:.2f} deg from {_deg(to)} deg")
     bench.read_times()
     reported = [("pose", bench.call("pose", bench.arm.pose))]
     bench.wait(QUIET_S)
@@ -520,7 +534,9 @@ def _check_oriented(bench: ArmBench, to: Pose) -> None:
         reported.append(("read_poses", Pose((*place,), (*turn,))))
     for name, pose in reported:
         if not angle_deg(pose, to) <= ORIENTED_DEG:
-            raise Seen(f"{name} returned the rotation vector {_deg(pose)} deg, not {_deg(to)}")
+            raise RuleViolation(
+                f"{name} returned the rotation vector {_deg(pose)} deg, not {_deg(to)}"
+            )
 
 
 def _check_kept(bench: ArmBench) -> None:
@@ -530,7 +546,7 @@ def _check_kept(bench: ArmBench) -> None:
     times = bench.read_times()[0]
     went_s = (max(times) - min(times)) / 1e9 if times else 0.0
     if went_s < 0.5 * PAUSE_S:
-        raise Seen(
+        raise RuleViolation(
             f"{PAUSE_S:g} s after the last read, read_poses returned {len(times)} samples of "
             f"{went_s:.3f} s"
         )
@@ -541,7 +557,7 @@ def _check_samples(bench: ArmBench, report: Report) -> None:
     last_ns, count = -1, 0
     for chunk in report.chunks:
         if int(chunk.t_ns[0]) == last_ns:
-            raise Seen(f"the pose of {last_ns} ns was read twice")
+            raise RuleViolation(f"the pose of {last_ns} ns was read twice")
         last_ns = int(chunk.t_ns[-1])
         for t_ns, xyz in zip(chunk.t_ns.tolist(), chunk.xyz_mm.tolist(), strict=True):
             count += 1
@@ -550,12 +566,12 @@ def _check_samples(bench: ArmBench, report: Report) -> None:
                 continue
             near = _nearest_mm(bench, pose, at_s - STAMP_S, at_s + STAMP_S)
             if not near <= OFF_LINE_MM:
-                raise Seen(
+                raise RuleViolation(
                     f"read_poses returned {_xyz(pose)} mm for {t_ns} ns, the arm was at "
                     f"{_xyz(bench.true_pose(at_s))} mm then"
                 )
     if not count:
-        raise Seen("read_poses returned no pose during a path")
+        raise RuleViolation("read_poses returned no pose during a path")
     within = np.concatenate([np.diff(chunk.t_ns) for chunk in report.chunks])
     between = np.array(
         [int(new.t_ns[0] - old.t_ns[-1]) for old, new in itertools.pairwise(report.chunks)]
@@ -563,7 +579,7 @@ def _check_samples(bench: ArmBench, report: Report) -> None:
     if min(len(within), len(between)) < FEWEST_STEPS:
         return
     if np.median(between) > LOST_SHARE * np.median(within):
-        raise Seen(
+        raise RuleViolation(
             f"samples read together are {np.median(within) / 1e6:g} ms apart, those of two reads "
             f"{np.median(between) / 1e6:g} ms: each read loses some"
         )
@@ -586,10 +602,10 @@ def _check_wrap(bench: ArmBench, wrap_s: float) -> None:
     check_order("poses", times)
     check_order("now_ns", nows)
     if len(times) < 2:
-        raise Seen("read_poses returned no poses")
+        raise RuleViolation("read_poses returned no poses")
     went_s, passed_s = (times[-1] - times[0]) / 1e9, (arrivals[-1] - arrivals[0]) / 1e9
     if not abs(went_s - passed_s) <= CLOCK_S + SHARE * passed_s:
-        raise Seen(
+        raise RuleViolation(
             f"times of poses went on by {went_s:.3f} s in {passed_s:.3f} s, where the controller's "
             f"clock passed {wrap_s:.3f} s"
         )

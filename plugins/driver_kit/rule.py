@@ -11,7 +11,7 @@ from sliplab.rigs.core.capabilities import RigError
 BenchT = TypeVar("BenchT", bound="Any")
 
 
-class Seen(Exception):
+class RuleViolation(Exception):
     """An observation that breaks the rule being checked, in words."""
 
 
@@ -53,8 +53,8 @@ class Rule(Generic[BenchT]):
     Attributes:
         name: name in reports of tests, such as ``stop while moving``.
         right: what a driver must do, one sentence.
-        check: raises `Seen` where the driver does something else, `NotTried` where it cannot be
-            tried. A `RigError` that it lets through is a fault that the driver made up.
+        check: raises `RuleViolation` where the driver does something else, `NotTried` where it
+            cannot be tried. A `RigError` that it lets through is a fault that the driver made up.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Rule(Generic[BenchT]):
         """
         try:
             self.check(bench)
-        except Seen as seen:
+        except RuleViolation as seen:
             raise RuleBroken(driver, self, str(seen)) from seen.__cause__
         except RigError as error:
             text = f"{bench.last_call} raised {type(error).__name__} where nothing was wrong: "

@@ -10,7 +10,7 @@ import numpy as np
 
 from sliplab.plugins.driver_kit.arm_bench import ArmBench
 from sliplab.plugins.driver_kit.arm_report import clock_offset_ns
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Seen
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
 from sliplab.plugins.driver_kit.stream_bench import BATCHES, StreamBench
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import ForceSensor, SyncBox
@@ -139,7 +139,7 @@ class ArmForceBench(StreamBench):
             slope = 2 * np.pi * SWING_HZ * SWING * np.abs(self.load)
             wrong = np.flatnonzero(~(np.abs(found - true) <= TIMED_S * slope + 1e-3).all(axis=1))
             if len(wrong):
-                raise Seen(
+                raise RuleViolation(
                     f"force and torque came as {np.round(found[wrong[0]], 4).tolist()} N and N m, "
                     f"on the tool were {np.round(true[wrong[0]], 4).tolist()}"
                 )
@@ -231,7 +231,9 @@ class SyncBench(StreamBench):
         bits = np.flatnonzero(CodeBits(self.seed, self.CODE).upto(ticks))
         due = (bits * (1e9 / self.RATE_HZ)).astype(np.int64)[: len(found)]
         if len(due) < len(found) or np.abs(due - found).max() > US_NS:
-            raise Seen(f"pulses came at {found.tolist()} ns, those of the code are {due.tolist()}")
+            raise RuleViolation(
+                f"pulses came at {found.tolist()} ns, those of the code are {due.tolist()}"
+            )
 
     def silence(self) -> None:
         """Let the fake hang."""

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sliplab.plugins.driver_kit.bench import POLL_S, QUIET_S, Bench, wraps_s
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Seen
+from sliplab.plugins.driver_kit.bench import POLL_S, QUIET_S, DeviceBench, wraps_s
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import Driver
 from sliplab.storage.streams import I64
@@ -26,7 +26,7 @@ NUMBER_SLACK = 1e-3
 """Largest error of a force in N, or of a torque in N m."""
 
 
-class StreamBench(Bench):
+class StreamBench(DeviceBench):
     """A device that streams, and its fake, which sends what the bench feeds it."""
 
     capability: ClassVar[type]
@@ -116,7 +116,7 @@ class StreamBench(Bench):
             np.array_equal(values, self._last[1][name])
             for name, values in vars(self._last[0]).items()
         ):
-            raise Seen("a read changed the arrays of the chunk that was read before it")
+            raise RuleViolation("a read changed the arrays of the chunk that was read before it")
         if len(chunk):
             self._last = chunk, copy.deepcopy(vars(chunk))
             self.came.append(chunk)
@@ -152,7 +152,7 @@ class StreamBench(Bench):
             return bool(got)
 
         if not self.until(first, self.bounds.call_s):
-            raise Seen(f"read returned nothing within {self.bounds.call_s:g} s of start")
+            raise RuleViolation(f"read returned nothing within {self.bounds.call_s:g} s of start")
         self.fed.clear()
         self._mark = self.mark()
         for _ in range(BATCHES):
@@ -164,11 +164,11 @@ class StreamBench(Bench):
             except RigError as error:
                 if not self.fed:
                     raise
-                raise Seen(f"{self.missing(got)}; then {error}") from None
+                raise RuleViolation(f"{self.missing(got)}; then {error}") from None
             return self.complete(got)
 
         if not self.until(complete, self.bounds.call_s):
-            raise Seen(
+            raise RuleViolation(
                 f"not all that was sent had been read after {self.bounds.call_s:g} s: "
                 f"{self.missing(got)}"
             )
@@ -204,7 +204,7 @@ class StreamBench(Bench):
             return len(got) >= max(count, 1)
 
         if not self.until(lambda: read(0), self.bounds.call_s):
-            raise Seen(f"read returned nothing within {self.bounds.call_s:g} s of start")
+            raise RuleViolation(f"read returned nothing within {self.bounds.call_s:g} s of start")
         self.quiet()
         self.forget()
         got.clear()
@@ -217,7 +217,7 @@ class StreamBench(Bench):
                 return got
         except RigError as error:
             then = f"; then {error}"
-        raise Seen(f"{count} were sent and {len(got)} came{then}")
+        raise RuleViolation(f"{count} were sent and {len(got)} came{then}")
 
     def forget(self) -> None:
         """Forget what was fed and what came."""
@@ -241,14 +241,14 @@ class StreamBench(Bench):
         for name in self.fields:
             sent, found = self._sent_and_found(name)
             if len(sent) != len(found):
-                raise Seen(f"{len(sent)} were sent and {len(found)} came ({name})")
+                raise RuleViolation(f"{len(sent)} were sent and {len(found)} came ({name})")
             if sent.shape != found.shape:
-                raise Seen(f"{name} of shape {found.shape} came, {sent.shape} was sent")
+                raise RuleViolation(f"{name} of shape {found.shape} came, {sent.shape} was sent")
             slack = self.slack_ns if name == "t_ns" else NUMBER_SLACK if _floats(sent) else 0
             off = np.abs(_signed(sent) - _signed(found))
             if not (off <= slack).all():
                 wrong = int(np.flatnonzero(~(off <= slack).reshape(len(off), -1).all(axis=1))[0])
-                raise Seen(
+                raise RuleViolation(
                     f"{name} came otherwise than it was sent, first in row {wrong}: "
                     f"{_short(found[wrong])} instead of {_short(sent[wrong])}"
                 )
@@ -269,7 +269,7 @@ class StreamBench(Bench):
         found = np.concatenate([getattr(chunk, field) for chunk in self.came])[-len(sent) :]
         off = np.abs(np.diff(found) - np.diff(sent)).max() if len(found) == len(sent) else None
         if off is None or off > 2 * self.slack_ns:
-            raise Seen(
+            raise RuleViolation(
                 f"times from {sent[0]} to {sent[-1]} came as {found[0]} to {found[-1]} ({field})"
             )
 

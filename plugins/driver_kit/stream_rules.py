@@ -12,7 +12,7 @@ import numpy as np
 
 from sliplab.plugins.driver_kit.bench import QUIET_S, check_close, check_methods
 from sliplab.plugins.driver_kit.camera_benches import PX_PER_MM, SIZE, EventBench, FrameBench
-from sliplab.plugins.driver_kit.rule import NotTried, Rules, Seen
+from sliplab.plugins.driver_kit.rule import NotTried, Rules, RuleViolation
 from sliplab.plugins.driver_kit.sensor_benches import LOAD, ArmForceBench, ForceBench
 from sliplab.plugins.driver_kit.stream_bench import StreamBench
 from sliplab.rigs.core.capabilities import RigError
@@ -63,7 +63,7 @@ def _declaration(bench: StreamBench) -> None:
         return  # a fake that the driver opens has no address
     problem = bench.call("ping", lambda: bench.driver.ping(bench.settings), bench.bounds.connect_s)
     if problem is not None:
-        raise Seen(f"ping of a fake that answers returned '{problem}'")
+        raise RuleViolation(f"ping of a fake that answers returned '{problem}'")
 
 
 @RULES.add("data", "everything that the device sends is read once, unchanged, in order of time")
@@ -85,7 +85,7 @@ def _arrays(bench: StreamBench) -> None:
                 continue
             kind, axes = COLUMNS[name]
             if (str(values.dtype), values.ndim) != (kind, axes) or len(values) != len(chunk):
-                raise Seen(
+                raise RuleViolation(
                     f"{name} was an array of {values.dtype} of shape {values.shape} for "
                     f"{len(chunk)} samples; it is one of {kind} with {axes} axes"
                 )
@@ -103,7 +103,9 @@ def _at_once(bench: StreamBench) -> None:
             bench.read()
             took.append(monotonic() - began)
     if not took or min(took) > AT_ONCE_S:
-        raise Seen(f"read took {min(took, default=9):.2f} s or more where nothing had come")
+        raise RuleViolation(
+            f"read took {min(took, default=9):.2f} s or more where nothing had come"
+        )
 
 
 @RULES.add(
@@ -133,7 +135,7 @@ def _before_start(bench: StreamBench) -> None:
     except RigError:
         early = []  # a device that is not streaming may say so
     if early:
-        raise Seen(f"{len(early)} were read before start")
+        raise RuleViolation(f"{len(early)} were read before start")
 
 
 @RULES.add(
@@ -156,7 +158,7 @@ def _times_fall_back(bench: StreamBench) -> None:
         return False
 
     if not bench.until(noticed, bench.bounds.news_s):
-        raise Seen(f"read did not report it within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"read did not report it within {bench.bounds.news_s:g} s")
 
 
 @RULES.add("fresh start", "start drops what came before it: a run never begins with older data")
@@ -172,7 +174,7 @@ def _fresh(bench: StreamBench) -> None:
     bench.start()
     for time in bench.gather():
         if mark is not None and time < mark:
-            raise Seen("the second run began with data of the first one")
+            raise RuleViolation("the second run began with data of the first one")
     if mark is not None:
         bench.check_fresh(mark)
 
@@ -192,7 +194,7 @@ def _stop(bench: StreamBench) -> None:
     bench.feed()
     late = bench.quiet()
     if late:
-        raise Seen(f"{len(late)} came after stop")
+        raise RuleViolation(f"{len(late)} came after stop")
     bench.start()
     _check_order(bench.gather())
 
@@ -208,7 +210,7 @@ def _read_after_stop(bench: StreamBench) -> None:
     bench.stop()
     late = bench.quiet()
     if not late or late[-1] <= last:
-        raise Seen("what came before stop could not be read after it")
+        raise RuleViolation("what came before stop could not be read after it")
 
 
 @RULES.add("silent", "a device that falls silent is reported in time; stop and close return")
@@ -246,7 +248,7 @@ def _unplugged(bench: StreamBench) -> None:
     if bench.refusal("start", bench.begin) is None and not bench.until(
         bench.fault, bench.bounds.news_s
     ):
-        raise Seen("it started again while it was unplugged")
+        raise RuleViolation("it started again while it was unplugged")
     bench.call("close", bench.close_device)
 
 
@@ -296,7 +298,7 @@ def _host_times(bench: StreamBench) -> None:
         now_ns = bench.host_ns()
         for host_ns in (host_ns for chunk in bench.came for host_ns in chunk.host_ns.tolist()):
             if not max(sent_ns - round(HOST_LATE_S * 1e9), last_ns) <= host_ns <= now_ns:
-                raise Seen(
+                raise RuleViolation(
                     f"host_ns was {host_ns} of a sample sent at {sent_ns} and read by {now_ns} ns "
                     "of the host's monotonic clock"
                 )
@@ -304,9 +306,9 @@ def _host_times(bench: StreamBench) -> None:
         if bench.came:
             soonest_s.append((int(bench.came[0].host_ns[0]) - sent_ns) / 1e9)
     if not soonest_s:
-        raise Seen("no sample came")
+        raise RuleViolation("no sample came")
     if min(soonest_s) > HOST_LATE_S:
-        raise Seen(f"host_ns was {min(soonest_s):.2f} s or more after a sample was sent")
+        raise RuleViolation(f"host_ns was {min(soonest_s):.2f} s or more after a sample was sent")
 
 
 # -- event cameras ----------------------------------------------------------------------------
@@ -316,7 +318,7 @@ def _host_times(bench: StreamBench) -> None:
 def _sensor_size(bench: EventBench) -> None:
     bench.connect()
     if (bench.device.width, bench.device.height) != SIZE:
-        raise Seen(
+        raise RuleViolation(
             f"width and height were {bench.device.width} x {bench.device.height}, the sensor has "
             f"{SIZE[0]} columns and {SIZE[1]} rows"
         )
@@ -337,9 +339,9 @@ def _region(bench: FrameBench) -> None:
         bench.stop()
         first = bench.came[0]
         if first.images.shape[1:] != SIZE[::-1]:
-            raise Seen(f"frames of {first.images.shape[1:]} px instead of {SIZE[::-1]}")
+            raise RuleViolation(f"frames of {first.images.shape[1:]} px instead of {SIZE[::-1]}")
         if first.number[0] != 0:
-            raise Seen(f"the first frame after start had number {first.number[0]}")
+            raise RuleViolation(f"the first frame after start had number {first.number[0]}")
 
 
 @FRAME_RULES.add(
@@ -358,7 +360,9 @@ def _another_region(bench: FrameBench) -> None:
     bench.start()
     bench.gather()
     if bench.came[-1].images.shape[1:] != OTHER_SIZE[::-1]:
-        raise Seen(f"frames of {bench.came[-1].images.shape[1:]} px instead of {OTHER_SIZE[::-1]}")
+        raise RuleViolation(
+            f"frames of {bench.came[-1].images.shape[1:]} px instead of {OTHER_SIZE[::-1]}"
+        )
     bench.check_content()
 
 
@@ -385,9 +389,9 @@ def _lost(bench: FrameBench) -> None:
 def _scale(bench: FrameBench) -> None:
     bench.connect()
     if not abs(bench.device.px_per_mm - PX_PER_MM) < 1e-6:
-        raise Seen(f"px_per_mm was {bench.device.px_per_mm}, not {PX_PER_MM}")
+        raise RuleViolation(f"px_per_mm was {bench.device.px_per_mm}, not {PX_PER_MM}")
     if not abs(bench.device.mid_exposure_ns - bench.mid_exposure_ns) <= 1000:
-        raise Seen(
+        raise RuleViolation(
             f"mid_exposure_ns was {bench.device.mid_exposure_ns} for an exposure of "
             f"{bench.settings.exposure_us:g} us"
         )
@@ -448,7 +452,9 @@ def _zero(bench: ForceBench | ArmForceBench) -> None:
             return bool(last) and bool((np.abs(np.array(last) - due) < 1e-3).all())
 
         if not bench.until(read, bench.bounds.news_s):
-            raise Seen(f"{bench.bounds.news_s:g} s later {what}: {np.round(last, 4).tolist()}")
+            raise RuleViolation(
+                f"{bench.bounds.news_s:g} s later {what}: {np.round(last, 4).tolist()}"
+            )
 
 
 @FORCE_RULES.add("overload", "a load out of range is a RigError in the next read, not a number")
@@ -466,12 +472,12 @@ def _overload(bench: ForceBench | ArmForceBench) -> None:
 def _check_order(times: list[int]) -> None:
     for before, after in itertools.pairwise(times):
         if after < before:
-            raise Seen(f"time {after} came after {before}")
+            raise RuleViolation(f"time {after} came after {before}")
 
 
 def _check_noticed(bench: StreamBench) -> None:
     if not bench.until(bench.fault, bench.bounds.news_s):
-        raise Seen(f"read did not report it within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"read did not report it within {bench.bounds.news_s:g} s")
 
 
 def check_clock_reads(rows: list[tuple[int, int, int]]) -> None:
@@ -482,7 +488,7 @@ def check_clock_reads(rows: list[tuple[int, int, int]]) -> None:
     """
     for (d1, b1, a1), (d2, b2, a2) in itertools.pairwise(rows):
         if not b2 - a1 - 2_000 <= d2 - d1 <= a2 - b1 + 2_000:
-            raise Seen(
+            raise RuleViolation(
                 f"between two reads the clock went on by {(d2 - d1) / 1e9:.3f} s, the host's by "
                 f"{(b2 - a1) / 1e9:.3f} to {(a2 - b1) / 1e9:.3f} s"
             )
@@ -502,7 +508,7 @@ def clock_row(bench: StreamBench, read_clock: Callable[[], Any]) -> tuple[int, i
         int(column[0]) for column in (reads.device_ns, reads.before_ns, reads.after_ns)
     )
     if not begun_ns <= before_ns <= after_ns <= ended_ns:
-        raise Seen(
+        raise RuleViolation(
             f"read_clock returned {before_ns} and {after_ns} ns as the host's times before and "
             f"after; it was called at {begun_ns} and returned at {ended_ns} ns"
         )

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 
 from sliplab.plugins.driver_kit.bench import COMMON_WRAPS_S, QUIET_S
-from sliplab.plugins.driver_kit.rule import NotTried, Rules, Seen
+from sliplab.plugins.driver_kit.rule import NotTried, Rules, RuleViolation
 from sliplab.plugins.driver_kit.sensor_benches import US_NS, SyncBench
 from sliplab.plugins.driver_kit.stream_rules import check_clock_reads, clock_row
 from sliplab.protocols.timing import Code
@@ -32,7 +32,7 @@ def _refused(bench: SyncBench) -> None:
             lambda r=rate_hz, s=seed: bench.device.start(r, s, bench.CODE),  # type: ignore[misc]
         )
         if error is None:
-            raise Seen(f"start took {rate_hz:g} Hz with seed {seed}")
+            raise RuleViolation(f"start took {rate_hz:g} Hz with seed {seed}")
 
 
 @RULES.add("clock", "read_clock lies between the host's times, and never falls back")
@@ -65,10 +65,10 @@ def _trains(bench: SyncBench) -> None:
             continue  # a box need not have every code
         train = bench.trains[-1] if bench.trains else None
         if train is None:
-            raise Seen("start returned, and no train had begun")
+            raise RuleViolation("start returned, and no train had begun")
         asked = bench.RATE_HZ, bench.seed, bench.CODE
         if (train.rate_hz, train.seed, train.code) != asked:
-            raise Seen(
+            raise RuleViolation(
                 f"requested {asked[0]:g} Hz, seed {asked[1]} and code {asked[2]}, the box sent "
                 f"{train.rate_hz:g} Hz, seed {train.seed} and code {train.code}"
             )
@@ -83,7 +83,7 @@ def _ticks_stop(bench: SyncBench) -> None:
     bench.gather()
     bench.stop()
     if not bench.until(lambda: bench.trains[-1] is None, LATE_S):
-        raise Seen(f"{LATE_S:g} s after stop the box still ticked")
+        raise RuleViolation(f"{LATE_S:g} s after stop the box still ticked")
 
 
 @RULES.add("clock at start", "tick 0 is at 0 of the clock that read_clock reads, in ns")
@@ -96,7 +96,7 @@ def _clock_at_start(bench: SyncBench) -> None:
     device_ns, before_ns, after_ns = clock_row(bench, bench.device.read_clock)
     least_s, most_s = (before_ns - started_ns) / 1e9, (after_ns - begun_ns) / 1e9
     if not least_s - LATE_S <= device_ns / 1e9 <= most_s + LATE_S:
-        raise Seen(
+        raise RuleViolation(
             f"{least_s:.3f} to {most_s:.3f} s after start its clock was {device_ns / 1e9:.3f} s"
         )
 
@@ -133,10 +133,10 @@ def _wraps(bench: SyncBench) -> None:
     due = np.flatnonzero(bits) * round(1e9 / SLOW_HZ)
     late = pulses[pulses > wrap_s * 1e9]
     if not len(late):
-        raise Seen(f"no pulse had a time after {wrap_s:.3f} s")
+        raise RuleViolation(f"no pulse had a time after {wrap_s:.3f} s")
     off = np.abs(late[:, None] - due[None]).min(axis=1)
     if (off > US_NS).any():
-        raise Seen(f"pulses came at {late.tolist()} ns, which are none of the code")
+        raise RuleViolation(f"pulses came at {late.tolist()} ns, which are none of the code")
 
 
 @RULES.add(
@@ -147,7 +147,7 @@ def _exposures(bench: SyncBench) -> None:
     bench.start()
     bench.gather()
     if len(bench.call("read_exposures", bench.device.read_exposures)):
-        raise Seen("an exposure came, though the camera had made none")
+        raise RuleViolation("an exposure came, though the camera had made none")
     expose = getattr(bench.fake, "expose", None)
     if expose is None:
         raise NotTried("the fake has no `expose`: it cannot simulate the camera's output")
@@ -162,11 +162,11 @@ def _exposures(bench: SyncBench) -> None:
         return bool(found)
 
     if not bench.until(came, bench.bounds.news_s):
-        raise Seen(f"no exposure came within {bench.bounds.news_s:g} s")
+        raise RuleViolation(f"no exposure came within {bench.bounds.news_s:g} s")
     bench.wait(QUIET_S)
     came()
     if len(found) != 1 or not clock[0] - US_NS <= found[0] <= clock[1] + US_NS:
-        raise Seen(f"an exposure between {clock[0]} and {clock[1]} ns came as {found} ns")
+        raise RuleViolation(f"an exposure between {clock[0]} and {clock[1]} ns came as {found} ns")
 
 
 # ---------------------------------------------------------------------------------------------
@@ -186,5 +186,5 @@ def _check_clock(bench: SyncBench) -> None:
             continue
         bench.wait(QUIET_S)
     if len(rows) < 2:
-        raise Seen("read_clock failed again and again")
+        raise RuleViolation("read_clock failed again and again")
     check_clock_reads(rows)

@@ -43,7 +43,7 @@ def publish(
 def write(request: ExportRequest) -> Exported:
     """Write committed trials as a data set in one folder, with a data card and checksums."""
     from sliplab.plugins.publish.forms import publish as publish_as
-    from sliplab.plugins.publish.publication import About, Publication
+    from sliplab.plugins.publish.publication import Publication, PublicationInfo
     from sliplab.storage.process import now
     from sliplab.storage.remote.mirror import open_store
 
@@ -52,7 +52,7 @@ def write(request: ExportRequest) -> Exported:
     campaigns = _campaigns(opened, options.get("campaign"))
     names = ", ".join(item.name for item in campaigns)
     licence = options.get("licence")
-    about = About(
+    about = PublicationInfo(
         options.get("title", f"Tactile slip trials: {names}"),
         tuple(options.get("creator", ())),
         licence,

@@ -31,7 +31,7 @@ from sliplab.storage.formats.stored import CampaignTexts, check_arrays
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.schema.trial import Counts, Provenance, SyncResult
+from sliplab.storage.schema.trial import Provenance, StreamCounts, SyncResult
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.derived import Derived
@@ -164,11 +164,11 @@ class PublishedTrial:
     """
 
     folder: Path
-    counts: Counts
+    counts: StreamCounts
     derived: dict[str, list[Path]]
 
     @uninterrupted
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
         """Commit the trial with its label and clocks.
 
         Args:

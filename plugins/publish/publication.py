@@ -54,7 +54,7 @@ SPLITS = {
 
 
 @dataclass(frozen=True)
-class About:
+class PublicationInfo:
     """Metadata of a publication, from the publisher.
 
     Attributes:
@@ -101,7 +101,7 @@ class Publication:
 
     store: Store
     campaigns: tuple[Campaign, ...]
-    about: About
+    about: PublicationInfo
     splits: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

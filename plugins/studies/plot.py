@@ -21,7 +21,7 @@ from sliplab.analysis.report.figures.style import (
 
 
 @dataclass(frozen=True)
-class Point:
+class DetectorPoint:
     """A detector.
 
     Attributes:
@@ -35,7 +35,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Panel:
+class AxisPair:
     """Two figures against each other, by name, and what their axes are called."""
 
     x: str
@@ -46,7 +46,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Bar:
+class FactorBar:
     """A value of a factor: mean, lowest and highest over seeds of each figure by name."""
 
     value: str
@@ -54,12 +54,14 @@ class Bar:
     spread: Mapping[str, tuple[float, float, float] | None]
 
 
-def cost_and_error(points: Sequence[Point], panels: Sequence[Panel], *, simulated: bool) -> str:
+def cost_and_error(
+    points: Sequence[DetectorPoint], panels: Sequence[AxisPair], *, simulated: bool
+) -> str:
     """Draw errors over costs, a panel for each pair side by side, as SVG.
 
     Args:
-        panels: `Panel.x` is a cost; a point without a cost above 0, or without the error, is left
-            out.
+        panels: `AxisPair.x` is a cost; a point without a cost above 0, or without the error, is
+            left out.
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(panels), figsize=(WIDTH, 3.2), squeeze=False)
@@ -97,7 +99,9 @@ def cost_and_error(points: Sequence[Point], panels: Sequence[Panel], *, simulate
         return svg_text(figure, simulated)
 
 
-def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated: bool) -> str:
+def front_panels(
+    points: Sequence[DetectorPoint], panels: Sequence[AxisPair], *, simulated: bool
+) -> str:
     """A scatter for each panel, two a row: the front above all others, the paper's point marked.
 
     A point without one of the two figures is not drawn.
@@ -121,7 +125,7 @@ def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated:
         return svg_text(figure, simulated)
 
 
-def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
+def _points(axes: Any, points: Sequence[DetectorPoint], panel: AxisPair) -> None:
     kinds = (
         ("another is nowhere worse and somewhere better", False, GREY, "o", 3, 1, 0.5),
         ("on the front", True, BLUE, "o", 4.5, 2, 0.85),
@@ -159,13 +163,13 @@ def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
 
 
 def factor_lines(
-    factors: Mapping[str, Sequence[Bar]], figures: Mapping[str, str], *, simulated: bool
+    factors: Mapping[str, Sequence[FactorBar]], figures: Mapping[str, str], *, simulated: bool
 ) -> str:
     """A column for each factor, a row for each figure: mean over seeds, lowest to highest.
 
     Args:
         factors: title to values in order.
-        figures: name in `Bar.spread` to the name of the axis.
+        figures: name in `FactorBar.spread` to the name of the axis.
     """
     with plt.rc_context(STYLE):
         widths = [max(2, len(bars)) for bars in factors.values()]
@@ -186,7 +190,7 @@ def factor_lines(
         return svg_text(figure, simulated)
 
 
-def _line(axes: Any, bars: Sequence[Bar], key: str) -> None:
+def _line(axes: Any, bars: Sequence[FactorBar], key: str) -> None:
     there = [(k, bar, bar.spread[key]) for k, bar in enumerate(bars)]
     known = [(k, bar, spread) for k, bar, spread in there if spread is not None]
     axes.plot([k for k, _, _ in known], [s[0] for _, _, s in known], lw=0.8, color=BLUE, alpha=0.5)

@@ -15,7 +15,7 @@ import numpy as np
 
 from sliplab.plugins.twin.contact_forces import relaxing
 from sliplab.plugins.twin.contact_lags import VARIATION, Growth, SteadyLags
-from sliplab.plugins.twin.contact_slips import SETTLES_S, Slips, find_slips, mean_seen
+from sliplab.plugins.twin.contact_slips import SETTLES_S, SlideSlips, find_slips, mean_seen
 from sliplab.plugins.twin.contact_tremor import STRENGTHENING, WEAK_MM_S
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.rims import COLUMN, RADIUS, ROW
@@ -54,7 +54,7 @@ class View:
     perspective: float = float("nan")
 
 
-def view_of(slips: Slips) -> View:
+def view_of(slips: SlideSlips) -> View:
     """Return the alignment of some slides' frames with the arm; NaN where not observable."""
     ways = [row for i in range(len(slips.trials)) for row in _ways(slips, i)]
     if len(ways) < 12:
@@ -90,7 +90,7 @@ def view_of(slips: Slips) -> View:
     )
 
 
-def _ways(slips: Slips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, float]]:
+def _ways(slips: SlideSlips, i: int) -> Iterator[tuple[F64, F64, F64, F64, float, float]]:
     """Yield what each sliding tip of a slide goes between the middles of its way's two halves.
 
     Yields:
@@ -132,7 +132,7 @@ def _robust(design: F64, right: F64, error: F64) -> F64:
     return best
 
 
-def frame_delay_ms(slips: Slips, steady: SteadyLags) -> float:
+def frame_delay_ms(slips: SlideSlips, steady: SteadyLags) -> float:
     """Return how late frames are against the arm's poses, ms; NaN with one speed alone.
 
     A delay adds to a lag in proportion to the speed, the same to that of every papilla. Friction
@@ -155,7 +155,7 @@ def frame_delay_ms(slips: Slips, steady: SteadyLags) -> float:
     return 1e3 * float(_robust(design, off[known], error)[0])
 
 
-def _off_their_depth(slips: Slips, values: F64) -> tuple[F64, F64]:
+def _off_their_depth(slips: SlideSlips, values: F64) -> tuple[F64, F64]:
     """Return values (k, m) less the mean of the slides of one depth, and that mean, (k, m)."""
     _, which = slips.depths
     mean = np.full(values.shape, np.nan)
@@ -193,7 +193,7 @@ def event_delay_ms(trials: Sequence[PilotTrial], rests: F64 | None) -> float:
 
 
 def _near(
-    slips: Slips, i: int, rests: F64, late_s: float, near_s: float
+    slips: SlideSlips, i: int, rests: F64, late_s: float, near_s: float
 ) -> Iterator[tuple[int, ...]]:
     """Yield events of each marker before, about and after `late_s` from its slip in a slide."""
     trial = slips.trials[i]
@@ -211,7 +211,7 @@ def _near(
         yield tuple(int(inside[a - first : b - first].sum()) for a, b in pairwise([first, *ends]))
 
 
-def force_delay_ms(slips: Slips, growth: Growth) -> float:
+def force_delay_ms(slips: SlideSlips, growth: Growth) -> float:
     """Return how late forces are against the arm's poses, ms; NaN without a force sensor.
 
     While all tips stick, the force along the slide follows the base's travel and its relaxation.
@@ -246,7 +246,7 @@ def force_delay_ms(slips: Slips, growth: Growth) -> float:
     return float(np.average(late, weights=weight)) if len(late) >= 3 else float("nan")
 
 
-def force_turn_deg(slips: Slips) -> float:
+def force_turn_deg(slips: SlideSlips) -> float:
     """Return the angle from the path to the forces in a slide's second half, degrees, else NaN."""
     found = []
     for (ahead, across), trial in zip(slips.direction, slips.trials, strict=True):

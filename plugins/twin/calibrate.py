@@ -34,14 +34,14 @@ from sliplab.plugins.twin.misfits import misfits
 from sliplab.plugins.twin.needs.flow import Needs, cheapest_path, measure_needs, write_cheapest
 from sliplab.plugins.twin.needs.judging import Marks, marks
 from sliplab.plugins.twin.parameters import GAIN_SLOPES, settings_of, value_of
-from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, Pilot, read_pilot
+from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, PilotSlides, read_pilot
 from sliplab.plugins.twin.posterior import Bank, Posterior, posterior, widened
-from sliplab.plugins.twin.shown import SameTrials, Shown, compare, show
-from sliplab.plugins.twin.statistics import Statistics, of_names
+from sliplab.plugins.twin.shown import SameTrials, SlideCurves, compare, show
+from sliplab.plugins.twin.statistics import SlideStatistics, of_names
 from sliplab.plugins.twin.worlds import (
+    DrawnWorld,
     Prior,
     Slides,
-    World,
     everywhere,
     guess_of,
     other_rig,
@@ -52,7 +52,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.rigs.mock.settings import Papilla
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
-from sliplab.rigs.twin import FittedValue, Range, TwinRecord
+from sliplab.rigs.twin import ConditionRange, FittedValue, TwinRecord
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
@@ -67,7 +67,7 @@ PREDICTED = 12
 
 
 @dataclass(frozen=True)
-class Calibration:
+class FitRequest:
     """Request of a fit, checked.
 
     Attributes:
@@ -97,7 +97,7 @@ def request(
     spread: float,
     seed: int,
     gain_error: float = GAIN_ERROR,
-) -> Calibration:
+) -> FitRequest:
     """Check a request before anything is simulated.
 
     Raises:
@@ -111,7 +111,7 @@ def request(
     for path in (out, cheapest_path(out)):
         if path.exists() and load_rig_file(path)[0].twin is None:
             raise InputError("--out", "", str(path), "exists and is no twin: use another name")
-    return Calibration(Prior(rig, spread, seed), rig_path, out, worlds, gain_error=gain_error)
+    return FitRequest(Prior(rig, spread, seed), rig_path, out, worlds, gain_error=gain_error)
 
 
 def fitted_rig(rig_path: Path) -> RigFile:
@@ -143,9 +143,9 @@ class SceneFit:
     """
 
     prior: Prior
-    pilot: Pilot
-    observed: Statistics
-    seen: Sequence[Statistics]
+    pilot: PilotSlides
+    observed: SlideStatistics
+    seen: Sequence[SlideStatistics]
     bank: Bank
     found: Posterior
     skin: Mapping[str, Any]
@@ -170,7 +170,7 @@ class SceneFit:
         ]
 
 
-def with_tracking_noise(rig: RigFile, pilot: Pilot) -> RigFile:
+def with_tracking_noise(rig: RigFile, pilot: PilotSlides) -> RigFile:
     """Return the rig with the noise of marker places that the pilot's holds show.
 
     It is measured, not fitted: a marker that sticks moves by nothing else.
@@ -185,7 +185,7 @@ def with_tracking_noise(rig: RigFile, pilot: Pilot) -> RigFile:
     return changed(rig, {"frame_camera": {"centroid_noise_px": float(f"{noise_px:.2g}")}})
 
 
-def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit:
+def fit_scene(store: Store, pilot: PilotSlides, prior: Prior, worlds: int) -> SceneFit:
     """Compare a pilot with simulated worlds."""
     prior = replace(prior, rig=with_tracking_noise(prior.rig, pilot), zero_mm=pilot.zero_mm)
     observed = pilot.statistics(guess_of(prior.rig, prior.zero_mm))
@@ -200,7 +200,7 @@ def fit_scene(store: Store, pilot: Pilot, prior: Prior, worlds: int) -> SceneFit
 
 
 def calibrate_scene(
-    store: Store, item: Collected, wanted: Calibration
+    store: Store, item: Collected, wanted: FitRequest
 ) -> tuple[TwinFit, SameTrials]:
     """Fit a rig's scene to a campaign's slides, and write the twin's rig file.
 
@@ -279,7 +279,7 @@ def calibrate_scene(
     return fit, trials
 
 
-def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
+def measured_papillae(rig: RigFile, pilot: PilotSlides) -> tuple[Papilla, ...] | None:
     """Return the papillae as the pilot shows them, for `mock.scene.skin`; None if it does not."""
     contact = read_contact(
         [pilot.slides[trial.id] for trial in pilot.fitted], guess_of(rig, pilot.zero_mm)
@@ -302,7 +302,7 @@ def measured_papillae(rig: RigFile, pilot: Pilot) -> tuple[Papilla, ...] | None:
     )
 
 
-def judging_worlds(scene: SceneFit) -> list[World]:
+def judging_worlds(scene: SceneFit) -> list[DrawnWorld]:
     """Return worlds of the twin, and as many of the rig file as it was, with the test trials.
 
     Worlds of the twin differ in what the pilot leaves open of the identified parameters.
@@ -317,7 +317,7 @@ def judging_worlds(scene: SceneFit) -> list[World]:
     rigs = [other_rig(rig, one, scene.skin) for one in values]
     rigs += [other_rig(rig, {}, {})] * PREDICTED
     return [
-        World(one, slides, seed, guess_of(rig, scene.prior.zero_mm))
+        DrawnWorld(one, slides, seed, guess_of(rig, scene.prior.zero_mm))
         for one, seed in zip(rigs, chance * 2, strict=True)
     ]
 
@@ -326,17 +326,17 @@ def judging_worlds(scene: SceneFit) -> list[World]:
 class Predicted:
     """The test trials in a world: their compared quantities, and their numbers for scores."""
 
-    shown: list[Shown]
+    shown: list[SlideCurves]
     marks: list[Marks]
 
 
-def predicted_in(world: World) -> Predicted:
+def predicted_in(world: DrawnWorld) -> Predicted:
     """Take the test trials in a world."""
     slides = world.take()
     return Predicted([show(slide) for slide in slides], [marks(slide) for slide in slides])
 
 
-def predict(worlds: Sequence[World]) -> tuple[list[Predicted], list[Predicted]]:
+def predict(worlds: Sequence[DrawnWorld]) -> tuple[list[Predicted], list[Predicted]]:
     """Take the test trials in worlds of the twin and in as many of the rig file as it was."""
     taken, half = everywhere("test trials (worlds)", predicted_in, worlds), len(worlds) // 2
     return taken[:half], taken[half:]
@@ -397,7 +397,7 @@ def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
     return found
 
 
-def write_twin(wanted: Calibration, scene: SceneFit, record: TwinRecord) -> None:
+def write_twin(wanted: FitRequest, scene: SceneFit, record: TwinRecord) -> None:
     """Write the twin's rig file, which extends the one that was fitted."""
     rounded = {key: _rounded(value) for key, value in scene.values.items()}
     mock = settings_of(wanted.rig.scene, rounded)
@@ -435,5 +435,5 @@ def _rounded(value: float) -> float:
     return float(f"{value:.5g}")
 
 
-def _range(values: Sequence[float]) -> Range:
-    return Range(least=float(min(values)), most=float(max(values)))
+def _range(values: Sequence[float]) -> ConditionRange:
+    return ConditionRange(least=float(min(values)), most=float(max(values)))

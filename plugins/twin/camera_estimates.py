@@ -23,7 +23,7 @@ from sliplab.analysis.labels.event_tracking import find_discs
 from sliplab.plugins.twin.alignment import event_delay_ms
 from sliplab.plugins.twin.event_times import (
     INTERVALS_US,
-    Scans,
+    ScanningReadout,
     count_intervals,
     dead_time_us,
     find_scans,
@@ -304,7 +304,7 @@ def _times(
     """Return estimates from the times of events: read-out, dead time, rate of hot pixels."""
     found: dict[str, float] = {}
     width, height = size_px
-    scans: list[Scans] = []
+    scans: list[ScanningReadout] = []
     for trial in trials[:SCANNED]:
         events = _events(trial, -np.inf, np.inf)
         part = slice(SCANNED_EVENTS)

@@ -29,7 +29,7 @@ from sliplab.plugins.twin.contact_lags import (
     steady_lags,
 )
 from sliplab.plugins.twin.contact_places import place_scatter, rest_places, rings_of
-from sliplab.plugins.twin.contact_slips import Slips, find_slips, mean_seen
+from sliplab.plugins.twin.contact_slips import SlideSlips, find_slips, mean_seen
 from sliplab.plugins.twin.contact_springs import Fit, Guess, Lags, fit_springs
 from sliplab.plugins.twin.contact_tremor import tremor_estimates
 from sliplab.plugins.twin.pilot import PilotTrial
@@ -46,7 +46,7 @@ PATH_STEP_MM = 0.1
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactSlides:
     """Slides as every estimate of the contact needs them.
 
     Attributes:
@@ -56,7 +56,7 @@ class Contact:
         steady: lags in steady slip. lags: the same by depth, with forces. springs: fitted to these.
     """
 
-    slips: Slips
+    slips: SlideSlips
     ring: I64
     place_mm: F64
     growth: Growth
@@ -66,7 +66,7 @@ class Contact:
     springs: Fit | None
 
 
-def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Contact | None:
+def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> ContactSlides | None:
     """Return the contact in slides; None without markers.
 
     Args:
@@ -81,10 +81,10 @@ def read_contact(trials: Sequence[PilotTrial], guess: Guess | None = None) -> Co
     steady = steady_lags(slips, growth)
     lags = lags_of(slips, ring, steady, growth)
     springs = fit_springs(lags, guess or Guess())
-    return Contact(slips, ring, place, growth, fitted is not None, steady, lags, springs)
+    return ContactSlides(slips, ring, place, growth, fitted is not None, steady, lags, springs)
 
 
-def contact_estimates(contact: Contact) -> dict[str, float]:
+def contact_estimates(contact: ContactSlides) -> dict[str, float]:
     """Return the estimates by name, NaN where these slides do not determine them."""
     growth = contact.growth if contact.fitted else Growth(*[float("nan")] * 4)
     return {
@@ -100,7 +100,7 @@ def contact_estimates(contact: Contact) -> dict[str, float]:
     }
 
 
-def lags_of(slips: Slips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
+def lags_of(slips: SlideSlips, ring: I64, table: SteadyLags, growth: Growth) -> Lags:
     """Return the lags by depth, weighted by their paths, and the forces by depth."""
     levels, which = slips.depths
     m = len(ring)
@@ -168,7 +168,7 @@ def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:
 # -- along the path ----------------------------------------------------------------------------
 
 
-def path_estimates(slips: Slips, growth: Growth, table: SteadyLags) -> dict[str, float]:
+def path_estimates(slips: SlideSlips, growth: Growth, table: SteadyLags) -> dict[str, float]:
     """Return the variation of friction along the paths and its length, from lags in steady slip."""
     steps = 16
     total, count = np.zeros(steps), np.zeros(steps)
@@ -232,7 +232,7 @@ class Papillae:
     friction_error: F64
 
 
-def papillae(contact: Contact) -> Papillae | None:
+def papillae(contact: ContactSlides) -> Papillae | None:
     """Return a pilot's estimates of each papilla; None without a fit."""
     fit, ring, place = contact.springs, contact.ring, contact.place_mm
     if fit is None:

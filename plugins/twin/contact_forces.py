@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from sliplab.plugins.twin.contact_lags import Growth
-from sliplab.plugins.twin.contact_slips import SETTLES_S, Slips, mean_seen
+from sliplab.plugins.twin.contact_slips import SETTLES_S, SlideSlips, mean_seen
 from sliplab.plugins.twin.contact_springs import Lags
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.storage.streams import F64, I64
@@ -21,7 +21,7 @@ def normal_at_rest(trial: PilotTrial) -> float:
     return float(mean_seen(trial.forces.force_n[(t >= -0.2) & (t < 0.0), 2]))
 
 
-def initial_slopes(slips: Slips, growth: Growth) -> F64:
+def initial_slopes(slips: SlideSlips, growth: Growth) -> F64:
     """Tangential stiffness of the sticking tips together, relaxed, N/mm, (k,); NaN where none."""
     result = np.full(len(slips.trials), np.nan)
     for i, trial in enumerate(slips.trials):
@@ -43,7 +43,7 @@ def initial_slopes(slips: Slips, growth: Growth) -> F64:
     return result
 
 
-def gross_forces(slips: Slips) -> F64:
+def gross_forces(slips: SlideSlips) -> F64:
     """Force along the slide and normal force in gross slip, N, (k, 2); NaN where there is none."""
     result = np.full((len(slips.trials), 2), np.nan)
     for i, trial in enumerate(slips.trials):
@@ -61,7 +61,7 @@ def gross_forces(slips: Slips) -> F64:
     return result
 
 
-def ring_stiffness(slips: Slips, ring: I64, growth: Growth) -> F64:
+def ring_stiffness(slips: SlideSlips, ring: I64, growth: Growth) -> F64:
     """Return force over lag of each ring's tips by depth, N/mm, (levels, rings); NaN if unknown.
 
     Stuck or sliding, a tip pulls with its spring, and its lag is seen: the measured force along
@@ -117,7 +117,7 @@ def _filled(t_s: F64, values: F64) -> F64:
     return np.interp(t_s, t_s[seen], values[seen]) if seen.any() else np.zeros(len(t_s))
 
 
-def force_estimates(slips: Slips, lags: Lags) -> dict[str, float]:
+def force_estimates(slips: SlideSlips, lags: Lags) -> dict[str, float]:
     """Return estimates from the forces at the deepest level; NaN without a force sensor."""
     gross = gross_forces(slips)
     share, time = hold_relaxation(slips)
@@ -139,7 +139,7 @@ def _slope(x: F64, y: F64) -> float:
     return float(np.polynomial.polynomial.polyfit(x[known], y[known], 1)[1])
 
 
-def hold_relaxation(slips: Slips) -> tuple[float, float]:
+def hold_relaxation(slips: SlideSlips) -> tuple[float, float]:
     """Return share and time of the normal force's relaxation in the hold; NaN without forces.
 
     One time for all slides, a final force and a relaxing one for each: least squares with these

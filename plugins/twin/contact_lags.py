@@ -14,7 +14,7 @@ from sliplab.plugins.twin.contact_slips import (
     AFTER_S,
     LEAST_PATH_MM,
     SETTLES_S,
-    Slips,
+    SlideSlips,
     mean_seen,
 )
 from sliplab.storage.streams import F64
@@ -58,7 +58,7 @@ class Growth:
         return result
 
 
-def fit_growth(slips: Slips) -> Growth | None:
+def fit_growth(slips: SlideSlips) -> Growth | None:
     """Fit how lags grow after the slips, all together; None without enough of them."""
     use = slips.slid & (slips.stretch_mm >= LEAST_STRETCH_MM)
     k, j = np.nonzero(use)
@@ -110,7 +110,7 @@ class SteadyLags:
     path_mm: F64
 
 
-def settled_lags(slips: Slips, i: int, growth: Growth) -> tuple[F64, F64]:
+def settled_lags(slips: SlideSlips, i: int, growth: Growth) -> tuple[F64, F64]:
     """Lag of one slide's tips while they slide, as if the springs had relaxed, (n, m), else NaN;
     and the frames' times."""
     t, lag = slips.frame_s[i], slips.lag_mm[i]
@@ -125,7 +125,7 @@ def settled_lags(slips: Slips, i: int, growth: Growth) -> tuple[F64, F64]:
     return settled, t
 
 
-def steady_lags(slips: Slips, growth: Growth) -> SteadyLags:
+def steady_lags(slips: SlideSlips, growth: Growth) -> SteadyLags:
     """Return every papilla's mean lag in every slide."""
     shape = slips.slipped_s.shape
     lag, path = np.full(shape, np.nan), np.zeros(shape)

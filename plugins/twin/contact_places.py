@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.plugins.twin.contact_slips import Slips, mean_seen
+from sliplab.plugins.twin.contact_slips import SlideSlips, mean_seen
 from sliplab.storage.streams import F64, I64
 
 
-def rest_places(slips: Slips) -> F64:
+def rest_places(slips: SlideSlips) -> F64:
     """Return each marker's place in the last 0.5 s of each hold, mm, (k, m, 2), NaN where unseen.
 
     Slides begin at different places of the plate: they are shifted onto those of
@@ -27,7 +27,7 @@ def rest_places(slips: Slips) -> F64:
     return places
 
 
-def rings_of(slips: Slips) -> tuple[I64, F64]:
+def rings_of(slips: SlideSlips) -> tuple[I64, F64]:
     """Return each marker's ring, 0 for the centre and -1 where it was never seen, and its place,
     (m, 2): `rest_places`."""
     place = mean_seen(rest_places(slips))

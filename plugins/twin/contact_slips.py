@@ -32,7 +32,7 @@ AFTER_S = np.array([0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 0.9, 1.3, 1.8, 2.5, 3.5, 5.
 
 
 @dataclass(frozen=True)
-class Slips:
+class SlideSlips:
     """Slips of m papillae in k slides.
 
     Attributes:
@@ -80,7 +80,7 @@ def mean_seen(values: F64, axis: int | tuple[int, ...] = 0) -> F64:
     return result
 
 
-def find_slips(trials: Sequence[PilotTrial]) -> Slips | None:
+def find_slips(trials: Sequence[PilotTrial]) -> SlideSlips | None:
     """Return the slips in those slides that have the usual number of markers; None without any."""
     counts = [trial.tips_mm.shape[1] for trial in trials]
     if not counts or max(counts) == 0:
@@ -89,7 +89,7 @@ def find_slips(trials: Sequence[PilotTrial]) -> Slips | None:
     kept = tuple(trial for trial in trials if trial.tips_mm.shape[1] == usual)
     found = [_slips_of(trial) for trial in kept]
     noise, free, slipped, stretch, after, lag, frame_s, path = zip(*found, strict=True)
-    return Slips(
+    return SlideSlips(
         kept,
         np.array([trial.slide.depth_mm for trial in kept]),
         np.array([trial.slide.speed_mm_s for trial in kept]),
@@ -106,7 +106,7 @@ def find_slips(trials: Sequence[PilotTrial]) -> Slips | None:
 
 
 def _slips_of(trial: PilotTrial) -> tuple[float, Mask, F64, F64, F64, F64, F64, F64]:
-    """Return the columns of `Slips` from `noise_mm` on."""
+    """Return the columns of `SlideSlips` from `noise_mm` on."""
     held = (trial.frame_s < 0.0) & (trial.frame_s >= -0.5)
     moving = (trial.frame_s >= 0.0) & (trial.frame_s <= trial.slide_s)
     along = trial.slide.direction

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.plugins.twin.contact_lags import LEAST_STRETCH_MM
-from sliplab.plugins.twin.contact_slips import SETTLES_S, Slips
+from sliplab.plugins.twin.contact_slips import SETTLES_S, SlideSlips
 from sliplab.storage.streams import F64
 
 C128 = npt.NDArray[np.complex128]
@@ -24,7 +24,7 @@ SAME_HZ = 0.07
 """Tones that are closer are one: slides take a dozen seconds."""
 
 
-def tremor_estimates(slips: Slips) -> dict[str, float]:
+def tremor_estimates(slips: SlideSlips) -> dict[str, float]:
     """Return the largest amplitude of the arm's tremor over the slides, and its frequency.
 
     All sliding tips lag by it together; friction of their own averages out and is slow. Its tones
@@ -79,7 +79,7 @@ def _largest(values: Sequence[float]) -> float:
     return float(np.mean(np.sort(values)[-4:])) if len(values) else float("nan")
 
 
-def common_lag(slips: Slips, i: int) -> tuple[F64, F64, float] | None:
+def common_lag(slips: SlideSlips, i: int) -> tuple[F64, F64, float] | None:
     """Return times and mean lag of the tips that slide early in a slide, 25 a second, mm; and the
     mean lag over the speed, s.
 

@@ -32,7 +32,7 @@ _LEADS = 64
 
 
 @dataclass(frozen=True)
-class Scans:
+class ScanningReadout:
     """A read-out that scans.
 
     Attributes:
@@ -44,7 +44,7 @@ class Scans:
     scan_us: float
 
 
-def find_scans(events: EventChunk, width: int) -> Scans | None:
+def find_scans(events: EventChunk, width: int) -> ScanningReadout | None:
     """Find the scans of a read-out; None where times do not show any.
 
     Args:
@@ -80,7 +80,7 @@ def find_scans(events: EventChunk, width: int) -> Scans | None:
     if _agreement(near, np.array([frequency]))[0] < COHERENT:
         return None
     period = 1.0 / frequency
-    return Scans(period, _scan_us(events, width, period))
+    return ScanningReadout(period, _scan_us(events, width, period))
 
 
 def _scan_us(events: EventChunk, width: int, period: float) -> float:

@@ -24,9 +24,9 @@ from sliplab.plugins.twin.camera_estimates import (
     PICTURE_TURN,
     SHIFT_TREND,
 )
-from sliplab.plugins.twin.contact_estimates import Contact
+from sliplab.plugins.twin.contact_estimates import ContactSlides
 from sliplab.plugins.twin.contact_lags import Growth, settled_lags
-from sliplab.plugins.twin.contact_slips import Slips
+from sliplab.plugins.twin.contact_slips import SlideSlips
 from sliplab.plugins.twin.contact_springs import SCATTER, Fit
 from sliplab.plugins.twin.document import MisfitCheck
 from sliplab.plugins.twin.parameters import CAMERA, CONTACT, PARAMETERS
@@ -79,7 +79,7 @@ NOISE_KEYS = frozenset(
 
 
 @dataclass(frozen=True)
-class Check:
+class MisfitTest:
     """A number that one kind of effect makes large.
 
     Attributes:
@@ -102,25 +102,29 @@ class Check:
     setup: bool = False
 
 
-def _view(key: str, title: str, unit: str, floor: float, signed: bool = True) -> Check:
-    return Check(key, title, "frames", unit, floor, IN_MM, signed, setup=True)
+def _view(key: str, title: str, unit: str, floor: float, signed: bool = True) -> MisfitTest:
+    return MisfitTest(key, title, "frames", unit, floor, IN_MM, signed, setup=True)
 
 
-def _trend(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
-    return Check(key, f"{title} drifts during the pilot", stream, "sigma", 0.5, touches, setup=True)
+def _trend(key: str, title: str, stream: Stream, touches: frozenset[str]) -> MisfitTest:
+    return MisfitTest(
+        key, f"{title} drifts during the pilot", stream, "sigma", 0.5, touches, setup=True
+    )
 
 
-def _delay(key: str, title: str, stream: Stream, touches: frozenset[str]) -> Check:
-    return Check(key, title, stream, "ms", 0.5, touches, signed=True, setup=True)
+def _delay(key: str, title: str, stream: Stream, touches: frozenset[str]) -> MisfitTest:
+    return MisfitTest(key, title, stream, "ms", 0.5, touches, signed=True, setup=True)
 
 
 CHECKS = (
-    Check(TILT, "plate tilted against the arm's", "frames", "mm/mm", 5e-4),
-    Check(STICKY, "friction of one papilla unlike that of the others", "frames", "sigma", 0.5),
-    Check(BROKEN, "slides in which a papilla is missing", "frames", "share", 0.25),
-    Check(LIGHT, "light that flickers", "events", "times noise", 0.2, CAMERA_KEYS),
-    Check(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
-    Check(SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5),
+    MisfitTest(TILT, "plate tilted against the arm's", "frames", "mm/mm", 5e-4),
+    MisfitTest(STICKY, "friction of one papilla unlike that of the others", "frames", "sigma", 0.5),
+    MisfitTest(BROKEN, "slides in which a papilla is missing", "frames", "share", 0.25),
+    MisfitTest(LIGHT, "light that flickers", "events", "times noise", 0.2, CAMERA_KEYS),
+    MisfitTest(RAMP, "slides that begin and end gently", "poses", "mm", 2e-3),
+    MisfitTest(
+        SPOT, "friction of one place of the plate unlike that of others", "frames", "sigma", 0.5
+    ),
     _view(TURN, "frame camera turned against the arm's axes", "deg", 0.05),
     _view(SCALE, "scale of the frames unlike the arm's", "share", 1e-3),
     _view(STRETCH, "scale of the frames unlike in two directions", "share", 1e-3, signed=False),
@@ -129,7 +133,7 @@ CHECKS = (
     _delay(FRAME_DELAY, "frames late or early against the arm's poses", "frames", IN_MM),
     _delay(EVENT_DELAY, "frames late or early against the events", "frames", IN_MM),
     _delay(FORCE_DELAY, "forces late or early against the arm's poses", "force", FORCE_KEYS),
-    Check(
+    MisfitTest(
         FORCE_TURN,
         "force sensor turned against the arm's axes",
         "force",
@@ -150,7 +154,7 @@ CHECKS = (
     ),
     _trend(CONTRAST_TREND, "contrast or threshold of events", "events", CAMERA_KEYS),
     _trend(NOISE_TREND, "noise of the event camera", "events", NOISE_KEYS),
-    Check(
+    MisfitTest(
         PICTURE_TURN,
         "event camera turned against the arm's axes",
         "events",
@@ -175,7 +179,7 @@ SHOWN_BY: Mapping[Stream, frozenset[str]] = {
 
 
 def misfit_numbers(
-    trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: Contact | None
+    trials: Sequence[PilotTrial], with_events: Sequence[PilotTrial], contact: ContactSlides | None
 ) -> dict[str, float]:
     """Return the number of every check by key, NaN where the slides do not determine it.
 
@@ -264,7 +268,7 @@ LOADED_MM = 0.8
 differ by less."""
 
 
-def missing_share(slips: Slips, ring: I64) -> float:
+def missing_share(slips: SlideSlips, ring: I64) -> float:
     """Largest share of the slides in which a papilla is not seen, or does not hold while its ring
     does, of one papilla."""
     seen = np.array([np.isfinite(lag).any(axis=0) for lag in slips.lag_mm])
@@ -290,7 +294,7 @@ _CELLS = 10_000
 """More than there are along an axis of the plate."""
 
 
-def largest_spot(slips: Slips, growth: Growth) -> float:
+def largest_spot(slips: SlideSlips, growth: Growth) -> float:
     """Largest deviation of the lags in a cell of the plate from each papilla's own, over its error.
 
     A papilla's lag in a cell is compared with its median over all cells at that depth. The error
@@ -316,7 +320,7 @@ def largest_spot(slips: Slips, growth: Growth) -> float:
     return float(np.max(total[full] / np.sqrt(count[full])) / scatter) if full.any() else np.nan
 
 
-def _lags_in_cells(slips: Slips, i: int, growth: Growth) -> tuple[I64, I64, F64]:
+def _lags_in_cells(slips: SlideSlips, i: int, growth: Growth) -> tuple[I64, I64, F64]:
     """Return the mean lag of each path of a sliding tip through a cell, mm, in one slide.
 
     Returns:
@@ -488,7 +492,7 @@ class Tail:
     itself, in units of the floor (`linear`), which is still longer.
 
     Attributes:
-        values: of the worlds, sorted, transformed, (n,). floor, linear: see `Check`.
+        values: of the worlds, sorted, transformed, (n,). floor, linear: see `MisfitTest`.
     """
 
     values: F64
@@ -548,7 +552,7 @@ def misfits(
         names: of q statistics. observed: of the pilot, (q,). s: of the worlds, (k, q); logarithms
             where they are positive.
     """
-    tried: list[tuple[Check, float, F64]] = []
+    tried: list[tuple[MisfitTest, float, F64]] = []
     for check in CHECKS:
         values = np.array([world[check.key] for world in worlds], np.float64)
         values, value = values[np.isfinite(values)], numbers[check.key]
@@ -561,7 +565,7 @@ def misfits(
         own = streams == stream
         if len(s) >= FEWEST and np.isfinite(observed[own]).any():
             values, value = distances(s[:, own], observed[own])
-            check = Check("", title, stream, "distance", 0.1, SHOWN_BY[stream])
+            check = MisfitTest("", title, stream, "distance", 0.1, SHOWN_BY[stream])
             tried.append((check, value, values[np.isfinite(values)]))
     tried = [it for it in tried if np.isfinite(it[1]) and len(it[2]) >= FEWEST]
     found = []

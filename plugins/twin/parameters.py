@@ -20,7 +20,7 @@ Stream = Literal["frames", "events", "force"]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class SceneParameter:
     """One number of a simulated rig.
 
     Attributes:
@@ -42,55 +42,67 @@ LAYER_STEP = "scene.skin.layer_step_mm"
 """Scale of `scene.skin.heights_mm`: one factor changes all steps, the centre is fixed."""
 
 CONTACT = (
-    Parameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),
-    Parameter("scene.friction.static_excess", "excess of static friction", "", ("frames",), 0.9),
-    Parameter(
+    SceneParameter("scene.friction.kinetic", "kinetic friction", "", ("frames", "force")),
+    SceneParameter(
+        "scene.friction.static_excess", "excess of static friction", "", ("frames",), 0.9
+    ),
+    SceneParameter(
         "scene.friction.path_variation", "friction's variation along a path", "", ("frames",), 0.3
     ),
-    Parameter("scene.friction.correlation_mm", "length of friction's variation", "mm", ("frames",)),
-    Parameter(
+    SceneParameter(
+        "scene.friction.correlation_mm", "length of friction's variation", "mm", ("frames",)
+    ),
+    SceneParameter(
         "scene.friction.papilla_scatter", "friction's scatter by papilla", "", ("frames",), 0.3
     ),
-    Parameter("scene.skin.youngs_modulus_mpa", "Young's modulus of the skin", "MPa", ("force",)),
-    Parameter("scene.skin.base_normal_n_per_m", "normal stiffness of the base", "N/m", ("force",)),
-    Parameter(
+    SceneParameter(
+        "scene.skin.youngs_modulus_mpa", "Young's modulus of the skin", "MPa", ("force",)
+    ),
+    SceneParameter(
+        "scene.skin.base_normal_n_per_m", "normal stiffness of the base", "N/m", ("force",)
+    ),
+    SceneParameter(
         "scene.skin.base_tangential_n_per_m",
         "tangential stiffness of the base",
         "N/m",
         ("frames", "force"),
     ),
-    Parameter(LAYER_STEP, "step of height between layers", "mm", ("frames",)),
-    Parameter(
+    SceneParameter(LAYER_STEP, "step of height between layers", "mm", ("frames",)),
+    SceneParameter(
         "scene.skin.height_scatter_mm", "scatter of the papillae's heights", "mm", ("frames",)
     ),
-    Parameter(
+    SceneParameter(
         "scene.skin.position_scatter_mm", "scatter of the papillae's places", "mm", ("frames",)
     ),
-    Parameter("scene.skin.relaxation_share", "share of a force that relaxes", "", ("frames",), 0.9),
-    Parameter("scene.skin.relaxation_s", "time of relaxation", "s", ("frames",)),
-    Parameter("arm.vibration_um", "arm's vibration", "um", ("frames",)),
-    Parameter("arm.vibration_hz", "frequency of the vibration", "Hz", ("frames",)),
+    SceneParameter(
+        "scene.skin.relaxation_share", "share of a force that relaxes", "", ("frames",), 0.9
+    ),
+    SceneParameter("scene.skin.relaxation_s", "time of relaxation", "s", ("frames",)),
+    SceneParameter("arm.vibration_um", "arm's vibration", "um", ("frames",)),
+    SceneParameter("arm.vibration_hz", "frequency of the vibration", "Hz", ("frames",)),
 )
 CAMERA = (
-    Parameter("event_camera.px_per_mm", "scale of the event camera", "px/mm", ("events",)),
-    Parameter("event_camera.radius_mm", "radius of the markers", "mm", ("events",)),
-    Parameter(
+    SceneParameter("event_camera.px_per_mm", "scale of the event camera", "px/mm", ("events",)),
+    SceneParameter("event_camera.radius_mm", "radius of the markers", "mm", ("events",)),
+    SceneParameter(
         "event_camera.shift_mm_per_n", "image's shift per force", "mm/N", ("events", "force")
     ),
-    Parameter(
+    SceneParameter(
         "event_camera.growth_mm_per_n", "markers' growth per force", "mm/N", ("events", "force")
     ),
-    Parameter("event_camera.edge_px", "width of the markers' edge", "px", ("events",)),
-    Parameter("event_camera.contrast", "markers' contrast (threshold kept)", "", ("events",)),
-    Parameter("event_camera.threshold_sigma", "mismatch of the threshold", "", ("events",)),
-    Parameter("event_camera.cutoff_hz", "bandwidth of a pixel", "Hz", ("events",)),
-    Parameter("event_camera.refractory_us", "refractory time", "us", ("events",)),
-    Parameter("event_camera.noise_hz", "noise of a pixel", "Hz", ("events",)),
-    Parameter("event_camera.leak_share", "share of leakage in the noise", "", ("events",), 1.0),
-    Parameter("event_camera.hot_pixels", "hot pixels", "", ("events",)),
-    Parameter("event_camera.hot_hz", "rate of a hot pixel", "Hz", ("events",)),
-    Parameter("event_camera.readout_hz", "scan rate of the read-out", "Hz", ("events",)),
-    Parameter("event_camera.scan_us", "duration of a scan", "us", ("events",)),
+    SceneParameter("event_camera.edge_px", "width of the markers' edge", "px", ("events",)),
+    SceneParameter("event_camera.contrast", "markers' contrast (threshold kept)", "", ("events",)),
+    SceneParameter("event_camera.threshold_sigma", "mismatch of the threshold", "", ("events",)),
+    SceneParameter("event_camera.cutoff_hz", "bandwidth of a pixel", "Hz", ("events",)),
+    SceneParameter("event_camera.refractory_us", "refractory time", "us", ("events",)),
+    SceneParameter("event_camera.noise_hz", "noise of a pixel", "Hz", ("events",)),
+    SceneParameter(
+        "event_camera.leak_share", "share of leakage in the noise", "", ("events",), 1.0
+    ),
+    SceneParameter("event_camera.hot_pixels", "hot pixels", "", ("events",)),
+    SceneParameter("event_camera.hot_hz", "rate of a hot pixel", "Hz", ("events",)),
+    SceneParameter("event_camera.readout_hz", "scan rate of the read-out", "Hz", ("events",)),
+    SceneParameter("event_camera.scan_us", "duration of a scan", "us", ("events",)),
 )
 PARAMETERS = (*CONTACT, *CAMERA)
 
@@ -106,7 +118,7 @@ GAIN_SLOPES: Mapping[str, float] = {
 with an image that moves less by it, differs from a gain in nothing that a pilot shows."""
 
 
-def value_of(mock: Any, parameter: Parameter) -> float:
+def value_of(mock: Any, parameter: SceneParameter) -> float:
     """Return a parameter's value in a simulated rig's settings; 0 where it is switched off."""
     if parameter.key == LAYER_STEP:
         heights = mock.scene.skin.heights_mm
@@ -141,7 +153,7 @@ def settings_of(mock: Any, values: Mapping[str, float]) -> dict[str, Any]:
     return found
 
 
-def prior_bounds(mock: Any, parameters: Sequence[Parameter], spread: float) -> tuple[F64, F64]:
+def prior_bounds(mock: Any, parameters: Sequence[SceneParameter], spread: float) -> tuple[F64, F64]:
     """Return least and largest logarithm of each parameter around a rig's values, both (p,).
 
     Args:
@@ -152,7 +164,7 @@ def prior_bounds(mock: Any, parameters: Sequence[Parameter], spread: float) -> t
 
 
 def drawn(
-    mock: Any, parameters: Sequence[Parameter], spread: float, rng: np.random.Generator
+    mock: Any, parameters: Sequence[SceneParameter], spread: float, rng: np.random.Generator
 ) -> dict[str, float]:
     """Draw values around those of a rig, uniform in their logarithms within `prior_bounds`."""
     logarithms = rng.uniform(*prior_bounds(mock, parameters, spread))

@@ -24,7 +24,7 @@ SURE_PX = 0.25
 
 
 @dataclass(frozen=True)
-class Slide:
+class SlideMotion:
     """The motion of a trial that presses and then slides straight.
 
     Attributes:
@@ -50,7 +50,7 @@ class Forces:
 
 
 @dataclass(frozen=True)
-class Camera:
+class SlideEvents:
     """Recording of a slide by the event camera.
 
     Attributes:
@@ -80,13 +80,13 @@ class PilotTrial:
     """
 
     trial: str
-    slide: Slide
+    slide: SlideMotion
     hold_s: float
     slide_s: float
     frame_s: F64
     tips_mm: F64
     base_mm: F64
-    camera: Camera | None = None
+    camera: SlideEvents | None = None
     forces: Forces | None = None
     zero_mm: float = 0.0
 
@@ -99,18 +99,18 @@ class PilotTrial:
         return moved
 
 
-def slide_of(program: Program) -> Slide | None:
+def slide_of(program: Program) -> SlideMotion | None:
     """Return the slide of a trial's program; None where it is another motion."""
     moves = [step for step in program.steps if isinstance(step, Move)]
     for before, step in pairwise(moves):
         if step.phase == "slide" and step.to.depth_mm == before.to.depth_mm:
             path = np.array([step.to.x_mm - before.to.x_mm, step.to.y_mm - before.to.y_mm])
             if np.hypot(*path) > 0.0:
-                return Slide(step.to.depth_mm, step.speed_mm_s, path / np.hypot(*path))
+                return SlideMotion(step.to.depth_mm, step.speed_mm_s, path / np.hypot(*path))
     return None
 
 
-def pilot_trial(slide: Slide, recording: Recording, places: Mapping[str, Any]) -> PilotTrial:
+def pilot_trial(slide: SlideMotion, recording: Recording, places: Mapping[str, Any]) -> PilotTrial:
     """Return a labelled recording of a slide as arrays.
 
     Args:
@@ -137,7 +137,7 @@ def pilot_trial(slide: Slide, recording: Recording, places: Mapping[str, Any]) -
         found = recording.events()
         line_us = np.asarray(recording.clock("events").to_reference(found.t_us * 1000))
         t_us = (line_us - start_ns) // 1000
-        camera = Camera(EventChunk(found.x, found.y, found.p, t_us), recording.event_px)
+        camera = SlideEvents(EventChunk(found.x, found.y, found.p, t_us), recording.event_px)
     if has_forces(recording):
         plate = plate_forces(recording)
         forces = Forces(seconds_after(start_ns, plate.t_ns), plate.force_n)

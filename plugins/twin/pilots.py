@@ -13,15 +13,15 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.plugins.twin.contact_springs import Guess
 from sliplab.plugins.twin.pilot import (
-    Camera,
     Forces,
     PilotTrial,
+    SlideEvents,
     base_at,
     pilot_trial,
     seconds_after,
     slide_of,
 )
-from sliplab.plugins.twin.statistics import Statistics, statistics
+from sliplab.plugins.twin.statistics import SlideStatistics, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.levels import choose_level
@@ -50,7 +50,7 @@ COARSE_MS = 4
 
 
 @dataclass(frozen=True)
-class Pilot:
+class PilotSlides:
     """The slides of a campaign.
 
     Attributes:
@@ -76,13 +76,13 @@ class Pilot:
         there = {"frames": True, "events": first.camera, "force": first.forces}
         return frozenset(name for name, found in there.items() if found is not None)
 
-    def statistics(self, guess: Guess) -> Statistics:
+    def statistics(self, guess: Guess) -> SlideStatistics:
         """Return what the fitted trials show."""
         slides = [self.slides[trial.id] for trial in self.fitted]
         return statistics(slides, self.with_events, guess)
 
 
-def read_pilot(store: Store, item: Collected) -> Pilot:
+def read_pilot(store: Store, item: Collected) -> PilotSlides:
     """Read the labelled slides of a campaign.
 
     Raises:
@@ -103,7 +103,7 @@ def read_pilot(store: Store, item: Collected) -> Pilot:
     if not parts[False]:
         raise StoreError(f"campaign '{item.name}': has no straight slides to fit a scene to")
     fitted = tuple(parts[False])
-    return Pilot(
+    return PilotSlides(
         item.plan,
         fitted,
         tuple(parts[True]),
@@ -226,7 +226,7 @@ def simulate_pilot(
             if with_events and sink.events:
                 events = EventChunk.joined(sink.events)
                 t_us = events.t_us - start_ns // 1000
-                camera = Camera(
+                camera = SlideEvents(
                     EventChunk(events.x, events.y, events.p, t_us),
                     (built.events.width, built.events.height),
                 )

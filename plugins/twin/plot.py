@@ -18,7 +18,7 @@ from sliplab.analysis.report.figures.style import (
     svg_text,
 )
 from sliplab.plugins.twin.document import ParameterFit
-from sliplab.plugins.twin.shown import Course, SameTrials, Shown
+from sliplab.plugins.twin.shown import Course, SameTrials, SlideCurves
 
 PANELS = 3
 """Test trials that are drawn over time."""
@@ -106,7 +106,7 @@ class Curves:
     before: Array
 
 
-def _curves(trials: SameTrials, of: Callable[[Shown], Course | None]) -> list[Curves]:
+def _curves(trials: SameTrials, of: Callable[[SlideCurves], Course | None]) -> list[Curves]:
     """Return a course of the first trials, the worlds' at the times of the pilot's."""
     found = []
     for k, trial in enumerate(trials.pilot[:PANELS]):
@@ -202,7 +202,7 @@ def maps(pilot: Array, twin: Array, before: Array, *, simulated: bool) -> str:
 
 
 @dataclass(frozen=True)
-class Trend:
+class ParameterTrend:
     """A parameter along a campaign.
 
     Attributes:
@@ -216,7 +216,7 @@ class Trend:
     percent: float
 
 
-def trends(panels: Sequence[Trend], *, simulated: bool) -> str:
+def trends(panels: Sequence[ParameterTrend], *, simulated: bool) -> str:
     """Draw parameters over the campaign, each over its value at the first reference."""
     with plt.rc_context(STYLE):
         rows = (len(panels) + 1) // 2

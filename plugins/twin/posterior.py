@@ -87,7 +87,7 @@ class Bank:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterPosterior:
     """The posterior of one parameter.
 
     Attributes:
@@ -120,7 +120,7 @@ class Posterior:
         samples: (k, p), one a world of the bank; their marginals are those of the estimates.
     """
 
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[ParameterPosterior, ...]
     samples: F64
 
 
@@ -148,7 +148,7 @@ class _Spread:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedBank:
     """A bank with its regression: gives the posterior of any observation with these statistics.
 
     Attributes:
@@ -216,7 +216,9 @@ class Fitted:
         count = max(FEWEST, round(_NEAR * len(self.bank)))
         return np.argsort(distance, kind="stable")[:count]
 
-    def _estimate(self, j: int, low: float, median: float, high: float, sd: float) -> Estimate:
+    def _estimate(
+        self, j: int, low: float, median: float, high: float, sd: float
+    ) -> ParameterPosterior:
         lower, upper = float(self.bank.lower[j]), float(self.bank.upper[j])
         tail = _LEVELS[0] * (upper - lower)
         # where little is learned, the chance of the bank may make it wider than the prior's
@@ -228,7 +230,7 @@ class Fitted:
             order = np.argsort(-power, kind="stable")
             shares = power / max(float(power.sum()), 1e-300)
             carriers = tuple((str(names[i]), float(shares[i])) for i in order if shares[i] >= 0.1)
-        return Estimate(
+        return ParameterPosterior(
             self.bank.parameters[j],
             float(median),
             sd,
@@ -242,7 +244,7 @@ class Fitted:
         )
 
 
-def fitted(bank: Bank, usable: Bools | None = None) -> Fitted:
+def fitted(bank: Bank, usable: Bools | None = None) -> FittedBank:
     """Return a bank with its regression.
 
     Args:
@@ -265,7 +267,7 @@ def fitted(bank: Bank, usable: Bools | None = None) -> Fitted:
     predicted = np.where(skilled, predicted, y.mean(axis=0))
     errors = y - predicted
     axes = np.linalg.eigh(np.atleast_2d(np.cov(errors.T)))[1]
-    return Fitted(
+    return FittedBank(
         bank,
         used,
         centre,
@@ -289,7 +291,7 @@ def posterior(bank: Bank, observed: F64) -> Posterior:
     return fitted(bank, np.isfinite(_checked(bank, observed))).at(observed)
 
 
-def widened(found: Posterior, slopes: F64, error: float) -> tuple[Estimate, ...]:
+def widened(found: Posterior, slopes: F64, error: float) -> tuple[ParameterPosterior, ...]:
     """Return estimates whose intervals allow for one more unknown that no statistic depends on.
 
     Args:

@@ -121,7 +121,7 @@ def quantities(trial: PilotTrial) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Shown:
+class SlideCurves:
     """A slide as it is compared, without its events, of which there are millions.
 
     Attributes:
@@ -139,10 +139,10 @@ class Shown:
     map: F64 | None = None
 
 
-def show(trial: PilotTrial) -> Shown:
+def show(trial: PilotTrial) -> SlideCurves:
     """Return what is compared of a slide."""
     along = np.nanmean(trial.moved_mm @ trial.slide.direction, axis=1)
-    found = Shown(trial.trial, quantities(trial), slips_s(trial), (trial.frame_s, along))
+    found = SlideCurves(trial.trial, quantities(trial), slips_s(trial), (trial.frame_s, along))
     if trial.camera is None:
         return found
     return replace(found, rate=rate_per_s(trial), map=event_map(trial))
@@ -157,9 +157,9 @@ class SameTrials:
         rings: layer of each marker, (m,). streams: that the pilot has.
     """
 
-    pilot: Sequence[Shown]
-    twin: Sequence[Sequence[Shown]]
-    before: Sequence[Sequence[Shown]]
+    pilot: Sequence[SlideCurves]
+    twin: Sequence[Sequence[SlideCurves]]
+    before: Sequence[Sequence[SlideCurves]]
     rings: F64
     streams: frozenset[str]
 
@@ -188,5 +188,5 @@ def compare(trials: SameTrials) -> tuple[QuantityCompared, ...]:
     return tuple(found)
 
 
-def _table(trials: Sequence[Shown]) -> Mapping[str, F64]:
+def _table(trials: Sequence[SlideCurves]) -> Mapping[str, F64]:
     return {name: np.array([trial.numbers[name] for trial in trials]) for name in QUANTITIES}

@@ -29,7 +29,7 @@ VERSION = 5
 
 
 @dataclass(frozen=True)
-class Statistics:
+class SlideStatistics:
     """Statistics of slides, by name.
 
     Attributes:
@@ -43,7 +43,7 @@ class Statistics:
 
 def statistics(
     slides: Sequence[PilotTrial], with_events: Collection[str], guess: Guess
-) -> Statistics:
+) -> SlideStatistics:
     """Return what slides show.
 
     Args:
@@ -55,7 +55,7 @@ def statistics(
     camera, checked = read_camera(seen)
     if seen:
         found |= camera
-    return Statistics(found, misfit_numbers(slides, seen, contact) | checked)
+    return SlideStatistics(found, misfit_numbers(slides, seen, contact) | checked)
 
 
 def of_names(values: Mapping[str, float], names: Sequence[str]) -> F64:

@@ -15,7 +15,7 @@ from scipy.stats import t as student
 
 from sliplab.plugins.twin.contact_forces import gross_forces
 from sliplab.plugins.twin.contact_lags import SteadyLags
-from sliplab.plugins.twin.contact_slips import Slips, find_slips, mean_seen
+from sliplab.plugins.twin.contact_slips import SlideSlips, find_slips, mean_seen
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.storage.streams import F64
 
@@ -54,7 +54,7 @@ def trend(values: F64, order: F64, others: F64) -> float:
 LAG, PULL, RATIO = "lag_trend", "pull_trend", "ratio_trend"
 
 
-def contact_trends(slips: Slips, steady: SteadyLags) -> dict[str, float]:
+def contact_trends(slips: SlideSlips, steady: SteadyLags) -> dict[str, float]:
     """Return the trends of lags, of forces over lags, and of friction force over normal force."""
     order, others = _conditions(slips)
     _, which = slips.depths
@@ -104,7 +104,7 @@ def _order(k: int) -> F64:
     return np.arange(k) / max(k - 1, 1)
 
 
-def _conditions(slips: Slips, with_speed: bool = True) -> tuple[F64, F64]:
+def _conditions(slips: SlideSlips, with_speed: bool = True) -> tuple[F64, F64]:
     """Return the slides' order, 0 to 1, (k,), and what forces depend on besides, (k, c)."""
     levels, which = slips.depths
     _, block = np.unique([trial.zero_mm for trial in slips.trials], return_inverse=True)

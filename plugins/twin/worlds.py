@@ -15,7 +15,7 @@ from sliplab.flows.scene_runs import changed
 from sliplab.plugins.twin.contact_springs import Guess
 from sliplab.plugins.twin.parameters import (
     PARAMETERS,
-    Parameter,
+    SceneParameter,
     drawn,
     prior_bounds,
     settings_of,
@@ -24,7 +24,7 @@ from sliplab.plugins.twin.parameters import (
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, simulate_pilot
 from sliplab.plugins.twin.posterior import Bank
-from sliplab.plugins.twin.statistics import VERSION, Statistics, of_names, statistics
+from sliplab.plugins.twin.statistics import VERSION, SlideStatistics, of_names, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.core.capabilities import RigError
@@ -54,7 +54,7 @@ class Slides:
 
 
 @dataclass(frozen=True)
-class World:
+class DrawnWorld:
     """A simulated rig on which slides are taken again.
 
     Attributes:
@@ -83,7 +83,7 @@ class World:
                 found[slide.trial] = slide
         return [found[trial.id] for trial in self.slides.trials]
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> SlideStatistics:
         """Take the trials and return what they show."""
         # the matrices are too small for threads of their own
         with threadpool_limits(1):
@@ -186,7 +186,7 @@ class Prior:
     zero_mm: float = field(default=ZERO_MM, kw_only=True)
 
     @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
+    def parameters(self) -> tuple[SceneParameter, ...]:
         """Parameters that are switched on in the rig file."""
         return tuple(it for it in PARAMETERS if value_of(self.rig.scene, it) > 0.0)
 
@@ -199,19 +199,19 @@ class Prior:
         """Return a world's parameters by key."""
         return self._drawn(number)[0]
 
-    def world(self, number: int, slides: Slides) -> World:
+    def world(self, number: int, slides: Slides) -> DrawnWorld:
         """Return a world, with another skin and another error of depth zero."""
         values, rng = self._drawn(number)
         zero_mm = float(rng.uniform(-self.zero_mm, self.zero_mm))
         specimen, chance = (int(n) for n in rng.integers(2**31, size=2))
         rig = other_specimen(self.rig, values, specimen, zero_mm)
-        return World(rig, slides, chance, guess_of(self.rig, self.zero_mm))
+        return DrawnWorld(rig, slides, chance, guess_of(self.rig, self.zero_mm))
 
     def _drawn(self, number: int) -> tuple[dict[str, float], np.random.Generator]:
         rng = np.random.default_rng([self.seed, number])
         return drawn(self.rig.scene, self.parameters, self.spread, rng), rng
 
-    def bank(self, seen: Sequence[Statistics]) -> Bank:
+    def bank(self, seen: Sequence[SlideStatistics]) -> Bank:
         """Return the first worlds and what they show as a bank."""
         names = tuple(dict.fromkeys(name for one in seen for name in one.fitted))
         keys = tuple(it.key for it in self.parameters)
@@ -228,7 +228,7 @@ class Prior:
 
 def simulated(
     title: str, prior: Prior, slides: Slides, worlds: int, kept: Derived
-) -> list[Statistics]:
+) -> list[SlideStatistics]:
     """Return what the prior's first worlds show of the slides.
 
     Simulated worlds are stored: a stopped run resumes, and other trials of the same conditions on
@@ -252,30 +252,30 @@ def simulated(
     found = _read(kept, name) if kept.fresh(name, key) else {}
     missing = [number for number in range(worlds) if number not in found]
 
-    def keep(job: int, one: Statistics) -> None:
+    def keep(job: int, one: SlideStatistics) -> None:
         found[missing[job]] = one
 
     try:
-        everywhere(title, World.statistics, [prior.world(k, slides) for k in missing], keep)
+        everywhere(title, DrawnWorld.statistics, [prior.world(k, slides) for k in missing], keep)
     finally:
         if missing and found:
             _write(kept, name, key, found)
     return [found[number] for number in range(worlds)]
 
 
-def _read(kept: Derived, name: str) -> dict[int, Statistics]:
+def _read(kept: Derived, name: str) -> dict[int, SlideStatistics]:
     arrays = kept.arrays(name)
     fitted, effects = (
         [dict(zip(arrays[f"{part}_names"].tolist(), row, strict=True)) for row in arrays[part]]
         for part in ("fitted", "effects")
     )
     return {
-        int(number): Statistics(*both)
+        int(number): SlideStatistics(*both)
         for number, *both in zip(arrays["worlds"], fitted, effects, strict=True)
     }
 
 
-def _write(kept: Derived, name: str, key: str, found: Mapping[int, Statistics]) -> None:
+def _write(kept: Derived, name: str, key: str, found: Mapping[int, SlideStatistics]) -> None:
     arrays: dict[str, Any] = {"worlds": np.array(sorted(found))}
     for part in ("fitted", "effects"):
         rows: list[dict[str, float]] = [getattr(found[k], part) for k in sorted(found)]
@@ -287,8 +287,8 @@ def _write(kept: Derived, name: str, key: str, found: Mapping[int, Statistics]) 
 
 def everywhere(
     title: str,
-    work: Callable[[World], T],
-    worlds: Sequence[World],
+    work: Callable[[DrawnWorld], T],
+    worlds: Sequence[DrawnWorld],
     done: Callable[[int, T], None] | None = None,
 ) -> list[T]:
     """Return `work` of every world, done on all cores.

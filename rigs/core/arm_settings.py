@@ -29,7 +29,7 @@ class PlaneSettings(StrictModel):
     above_mm: Triple
 
 
-class Limits(StrictModel):
+class ArmLimits(StrictModel):
     """Limits of the arm, checked before every move, whatever a protocol says."""
 
     low_mm: Triple
@@ -48,7 +48,7 @@ class Limits(StrictModel):
     """Smallest allowed angle of wrist 2 (UR) or joint 5 (ABB) from the singularity."""
 
     @rule
-    def _makes_sense(self) -> Limits:
+    def _makes_sense(self) -> ArmLimits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
                 raise KeyedError(".low_mm", list(self.low_mm), f"{axis} is not below high_mm")
@@ -72,7 +72,7 @@ class BaseArmSettings(DriverSettings):
     """The controller has no clock to read: poses are stamped by this computer's."""
     host: Host
     tool: ToolSettings = ToolSettings()
-    limits: Limits
+    limits: ArmLimits
 
 
 _SHORTEST_MM = 1.0

@@ -112,7 +112,7 @@ class ToolCentrePoint(StrictModel):
     method: Method
 
 
-class Lens(StrictModel):
+class LensCalibration(StrictModel):
     """The outside camera: pinhole model with Brown distortion, in OpenCV's convention."""
 
     scale_px_per_mm: float = Field(gt=0, le=200)
@@ -164,7 +164,7 @@ class Calibration(StrictModel):
     """Depth of the centre papilla when touching off detects it, measured once with a gauge."""
     depth_zero: DepthZero | None = None
     tool_centre_point: ToolCentrePoint | None = None
-    lens: Lens | None = None
+    lens: LensCalibration | None = None
     event_crop: EventCrop | None = None
     max_age: MaxAge = MaxAge()
 

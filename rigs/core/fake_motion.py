@@ -78,7 +78,7 @@ STILL = Ramp(0.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Line:
+class StraightMove:
     """One straight move that starts at a given time, s."""
 
     begin: Pose
@@ -109,10 +109,10 @@ class StraightMotion:
     """
 
     def __init__(
-        self, at: Pose, on_line: Callable[[Line, float], None] = lambda line, t_s: None
+        self, at: Pose, on_line: Callable[[StraightMove, float], None] = lambda line, t_s: None
     ) -> None:
         self._lock, self._on_line = Lock(), on_line
-        self._line = Line(at, at, STILL, 0.0)
+        self._line = StraightMove(at, at, STILL, 0.0)
         self._rest_s = 0.0
 
     def pose(self, t_s: float) -> Pose:
@@ -132,7 +132,9 @@ class StraightMotion:
             length = distance_mm(begin, to)
             if length < ON_THE_SPOT_MM:
                 length = angle_deg(begin, to) or length
-            self._follow(Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s)
+            self._follow(
+                StraightMove(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s
+            )
 
     def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
         """Continue to `to` without stopping, if it lies straight ahead at the same speed.
@@ -166,20 +168,20 @@ class StraightMotion:
             target = between(line.begin, line.end, share)
             if braking_mm <= 0 or speed <= 0:
                 here = line.pose(t_s)
-                self._follow(Line(here, here, STILL, t_s), t_s)
+                self._follow(StraightMove(here, here, STILL, t_s), t_s)
                 return
             # A ramp down is the second half of a move twice as long that began in the past.
             brake = speed * speed / (2 * braking_mm)
             past = _pose_before(line, gone, braking_mm)
             ramp = Ramp(2 * braking_mm, speed, brake)
-            self._follow(Line(past, target, ramp, t_s - ramp.seconds / 2), t_s)
+            self._follow(StraightMove(past, target, ramp, t_s - ramp.seconds / 2), t_s)
 
-    def _follow(self, line: Line, t_s: float) -> None:
+    def _follow(self, line: StraightMove, t_s: float) -> None:
         self._line, self._rest_s = line, line.start_s + line.ramp.seconds
         self._on_line(line, t_s)
 
 
-def _pose_before(line: Line, gone: float, distance_mm: float) -> Pose:
+def _pose_before(line: StraightMove, gone: float, distance_mm: float) -> Pose:
     """Return the pose `distance_mm` before the current one, extrapolated before the start."""
     return between(line.begin, line.end, (gone - distance_mm) / line.ramp.length)
 

@@ -268,7 +268,7 @@ def _unusable(text: str) -> RigError:
 
 
 @dataclass
-class Course:
+class PressPlaces:
     """The places of a program, where a press ends at its force and not at the planned depth.
 
     Attributes:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
@@ -77,7 +77,7 @@ class PlateLimits:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Coordinate:
     """A limited coordinate of a pose, mm."""
 
     error: type[GuardError]
@@ -107,7 +107,7 @@ class Guard:
         ValueError: limits in the plate's frame without a plate.
     """
 
-    def __init__(self, limits: Limits | None, plate_limits: PlateLimits | None = None) -> None:
+    def __init__(self, limits: ArmLimits | None, plate_limits: PlateLimits | None = None) -> None:
         self._limits, self._plate_limits = limits, plate_limits
         self._frame: PlateFrame | None = None
         if limits is None:
@@ -198,7 +198,7 @@ class Guard:
             GuardError: the pose is outside, or turned too far.
         """
         where = f"the arm was stopped {when}, where its pose shows"
-        before: list[_Place] | None = None
+        before: list[_Coordinate] | None = None
         for number, place in enumerate(self._places(pose, plate, closed_mm)):
             if place.excess <= MEASURED_MM:
                 continue
@@ -251,7 +251,9 @@ class Guard:
                 name = f"speed of the sensor's rim at {turn:g} deg/s:"
                 raise SpeedError(name, rim, self._plate_limits.speed_mm_s, "mm/s", where)
 
-    def _places(self, pose: Pose, plate: PlateFrame | None, closed_mm: float) -> Iterator[_Place]:
+    def _places(
+        self, pose: Pose, plate: PlateFrame | None, closed_mm: float
+    ) -> Iterator[_Coordinate]:
         """Return the limited coordinates of a pose."""
         limits, own = self._limits, self._plate_limits
         if limits is not None:
@@ -263,13 +265,13 @@ class Guard:
                 "xyz", xyz, limits.low_mm, limits.high_mm, strict=True
             ):
                 name = f"{axis} in the {limits.frame} frame"
-                yield _Place(WorkspaceError, name, value, low, high)
+                yield _Coordinate(WorkspaceError, name, value, low, high)
             if limits.depth_mm is not None and taught is not None:
-                yield _Place(DepthError, "depth", taught.depth_mm, -math.inf, limits.depth_mm)
+                yield _Coordinate(DepthError, "depth", taught.depth_mm, -math.inf, limits.depth_mm)
         if own is not None and plate is not None:
             here = plate.position(pose.xyz_mm)
             depth = here.depth_mm + closed_mm
-            yield _Place(DepthError, "depth in contact", depth, -math.inf, own.depth_mm)
+            yield _Coordinate(DepthError, "depth in contact", depth, -math.inf, own.depth_mm)
             reach = math.hypot(here.x_mm, here.y_mm)
             name = "distance from the plate's centre"
-            yield _Place(WorkspaceError, name, reach, -math.inf, own.reach_mm)
+            yield _Coordinate(WorkspaceError, name, reach, -math.inf, own.reach_mm)

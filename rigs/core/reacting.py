@@ -19,7 +19,7 @@ from typing import Literal, Protocol
 
 from sliplab.protocols.program import ACTING, Move, Position, Program, Step
 from sliplab.rigs.core.capabilities import ArmFault, RigError
-from sliplab.rigs.core.force_watch import Course
+from sliplab.rigs.core.force_watch import PressPlaces
 from sliplab.rigs.core.rig import Rig, StaysInContact, arm_fault, nuisances_of
 from sliplab.storage.streams import Sink
 
@@ -33,7 +33,7 @@ _SENSES = ("event camera", GRIPPER)
 
 
 @dataclass(frozen=True)
-class Evidence:
+class DetectionTimes:
     """Times of a detection, up to the decision, ms.
 
     Attributes:
@@ -53,7 +53,7 @@ class Evidence:
 class SlipDetected(Exception):
     """A watcher detected slip and triggers the reflex; raised only while it is armed."""
 
-    def __init__(self, evidence: Evidence | None = None) -> None:
+    def __init__(self, evidence: DetectionTimes | None = None) -> None:
         super().__init__("slip")
         self.evidence = evidence
 
@@ -127,7 +127,7 @@ class Reaction:
     depth_mm: float
     closed_mm: float = 0.0
     stalled: bool = False
-    evidence: Evidence | None = None
+    evidence: DetectionTimes | None = None
 
 
 class SafeState(StaysInContact):
@@ -180,7 +180,7 @@ def run_watched(
     reaction: Reaction | None = None
     with rig.safely(program.home):
         rig.begin_trial(program.home, seed, nuisances_of(program))
-        course, streaming = Course(program.home), False
+        course, streaming = PressPlaces(program.home), False
         for index, planned in enumerate(program.steps):
             step = course.step(planned)
             if step.recorded and not streaming:
@@ -255,7 +255,7 @@ def _react(
     reflex: Reflex,
     watcher: Watcher,
     sink: Sink | None,
-    evidence: Evidence | None,
+    evidence: DetectionTimes | None,
 ) -> Reaction:
     """Carry out a reflex; streams are read meanwhile where they have a sink."""
     began_ns = rig.clock.now_ns()

@@ -52,7 +52,7 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
     Truth,
 )
-from sliplab.rigs.core.force_watch import Course, ForceLimitError, ForceWatch
+from sliplab.rigs.core.force_watch import ForceLimitError, ForceWatch, PressPlaces
 from sliplab.rigs.core.further import FurtherStream
 from sliplab.rigs.core.gripper_check import check_move, check_state
 from sliplab.rigs.core.guard import Guard
@@ -317,7 +317,7 @@ class Rig:
             if self.force is not None and self._forces is None:
                 self._watch_forces()  # a simulated sensor without a limit has its range
             steps, path = [], []
-            course, recording, reference = Course(program.home), False, 0
+            course, recording, reference = PressPlaces(program.home), False, 0
             for index, planned in enumerate(program.steps):
                 step, began = course.step(planned), course.at
                 if step.recorded and not recording:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
 from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.pose import angle_deg, distance_mm
@@ -64,7 +64,7 @@ class ThreadedArm(ABC):
     A subclass implements `state`, `_follow_path` and `_abort`.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: ArmLimits) -> None:
         self._guard = Guard(limits)
         self._stream = PoseStream()
         self._lost: str | None = "not connected"

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
-from sliplab.rigs.core.fake_motion import STILL, Line, StraightMotion
-from sliplab.rigs.mock.path import EVERY, ArmPath, ContactPlane, Leg, tremor_envelope
+from sliplab.rigs.core.fake_motion import STILL, StraightMotion, StraightMove
+from sliplab.rigs.mock.path import EVERY, ArmPath, Leg, TrueSurface, tremor_envelope
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ I64 = npt.NDArray[np.int64]
 class _TimedLine:
     """A line that applies from `since_ns`, total true time, and the states at its ends."""
 
-    line: Line
+    line: StraightMove
     since_ns: int
     end_ns: int
     begin: F64
@@ -47,12 +47,12 @@ class FakeArmPath(ArmPath):
             fake has to stop too.
     """
 
-    def __init__(self, plane: ContactPlane, pose: Pose, controller: ClockMap) -> None:
+    def __init__(self, plane: TrueSurface, pose: Pose, controller: ClockMap) -> None:
         super().__init__(plane, pose)
         self._controller = controller
         self._past_ns = 0
         self._lock = threading.Lock()
-        rest = Line(pose, pose, STILL, 0.0)
+        rest = StraightMove(pose, pose, STILL, 0.0)
         self._lines = [_TimedLine(rest, -(1 << 62), -(1 << 62), self._rest, self._rest)]
         self.motion = StraightMotion(pose, self._on_line)
         self.cut_ns: int | None = None
@@ -116,7 +116,7 @@ class FakeArmPath(ArmPath):
             current = [line for line in self._lines if line.since_ns <= total][-1]
             return total < current.end_ns
 
-    def _on_line(self, line: Line, t_s: float) -> None:
+    def _on_line(self, line: StraightMove, t_s: float) -> None:
         since = self._controller.to_device(round(t_s * 1e9))
         end = self._controller.to_device(round((line.start_s + line.ramp.seconds) * 1e9))
         begin_state, end_state = self._state(line.begin), self._state(line.end)

@@ -46,11 +46,11 @@ from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
-from sliplab.rigs.mock.path import ContactPlane
-from sliplab.rigs.mock.settings import EventCamera, MockSettings
+from sliplab.rigs.mock.path import TrueSurface
+from sliplab.rigs.mock.settings import MockEventCameraSettings, MockSettings
 from sliplab.rigs.mock.sync import FreeRun, MockSyncBox
 from sliplab.rigs.mock.truth import plate_course, truth_of, watch_plate
-from sliplab.rigs.mock.world import World, start_pose
+from sliplab.rigs.mock.world import SimulatedWorld, start_pose
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
 
@@ -93,11 +93,11 @@ class SimulationServer:
         _warm_up(settings, timing)
         self._origin_ns = time.monotonic_ns() - LAG_NS
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
-        plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+        plane = TrueSurface.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self._arm_clock = clocks.arm
         self._arm_by_host = devices.arm.host_clock
         self._path = FakeArmPath(plane, start_pose(settings), clocks.arm)
-        self.world = World(settings, self._path, run_on=True)
+        self.world = SimulatedWorld(settings, self._path, run_on=True)
         self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
         self._box = MockSyncBox(self.world)
         self._events = MockEventCamera(self.world, self._box)
@@ -161,7 +161,7 @@ class SimulationServer:
         self._further: dict[str, MockEventCamera] = {}
         self._make_further: dict[str, Callable[[], FakeEventCamera]] = {}
         for name, (kind, made) in (further or {}).items():
-            own = Identity[EventCamera](name, made, made.clock_ppm, made.seed)
+            own = Identity[MockEventCameraSettings](name, made, made.clock_ppm, made.seed)
             self._further[name] = MockEventCamera(self.world, self._box, own)
             fake = find_driver(kind, EventCameraDriver).fake
             assert fake is not None  # the rig file was checked against it

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.path import SENSOR
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
@@ -30,7 +30,7 @@ class ToolLoad:
     """
 
     def __init__(
-        self, world: World, sensor: MockForceSensor, controller: ClockMap, range_n: float
+        self, world: SimulatedWorld, sensor: MockForceSensor, controller: ClockMap, range_n: float
     ) -> None:
         self._world, self._sensor, self._controller = world, sensor, controller
         self._range_n, self._beyond = range_n, False

@@ -10,7 +10,7 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Progress, S
 from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, undisturbed
 from sliplab.rigs.mock.path import TOOL, Leg
 from sliplab.rigs.mock.sync import MockSyncBox, SyncInput
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.streams import PoseChunk, PulseChunk
 
 BACKLOG_NS = 120_000_000_000
@@ -24,7 +24,7 @@ class MockArm:
         wired: True if the sync line reaches its digital input.
     """
 
-    def __init__(self, world: World, box: MockSyncBox, *, wired: bool = True) -> None:
+    def __init__(self, world: SimulatedWorld, box: MockSyncBox, *, wired: bool = True) -> None:
         self._world, self._wired = world, wired
         self._input = SyncInput(world, box, "arm")
         self._connected = False

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.mock.fault_settings import ClockDrift, ClockJump, ClockRestart, Device
 from sliplab.rigs.mock.faults import FaultBook
-from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.mock.settings import ClockErrors
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.clockmap import ClockMap
 
@@ -30,7 +30,7 @@ _CLOCK_FAULTS: tuple[type[ClockDrift | ClockJump | ClockRestart], ...] = (
 
 
 @dataclass(frozen=True)
-class TrialClocks:
+class ClockMaps:
     """Maps from true time to device time for one trial, ns."""
 
     arm: ClockMap
@@ -39,7 +39,7 @@ class TrialClocks:
     sync_box_ppb: int
     """Drift of the sync box, which counts from its own start and has no offset."""
 
-    def after(self, past_ns: int) -> TrialClocks:
+    def after(self, past_ns: int) -> ClockMaps:
         """Return the same clocks with the true time `past_ns` as time 0."""
         return replace(
             self,
@@ -56,7 +56,7 @@ def shifted(clock: ClockMap, past_ns: int) -> ClockMap:
     )
 
 
-def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClocks:
+def trial_clocks(settings: ClockErrors, rig_seed: int, trial_seed: int) -> ClockMaps:
     """Draw a trial's clocks: drifts from the rig's seed, offsets from the trial's."""
     drift = generator(rig_seed, "clock drift").uniform(-1.0, 1.0, 4)
     longest = int(settings.offset_h * HOUR_NS)
@@ -66,10 +66,12 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
         ClockMap.line(0, int(start), round(share * ppm * 1000))
         for start, share, ppm in zip(offset, drift, largest, strict=False)
     )
-    return TrialClocks(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
+    return ClockMaps(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
 
 
-def own_clock(settings: Clocks, ppm: float, name: str, rig_seed: int, trial_seed: int) -> ClockMap:
+def own_clock(
+    settings: ClockErrors, ppm: float, name: str, rig_seed: int, trial_seed: int
+) -> ClockMap:
     """Draw the clock of a further device by its name, as `trial_clocks` does those of the first."""
     drift = float(generator(rig_seed, f"clock drift of {name}").uniform(-1.0, 1.0))
     longest = int(settings.offset_h * HOUR_NS)
@@ -207,7 +209,7 @@ class FaultyClock(ClockMap):
         return low
 
 
-def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
+def with_faults(clocks: ClockMaps, faults: FaultBook) -> ClockMaps:
     """Return the clocks with the trial's clock faults applied."""
     if not any(faults.of(kind) for kind in _CLOCK_FAULTS):
         return clocks

@@ -20,11 +20,16 @@ from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, Furt
 from sliplab.rigs.mock.gripper import MockGripper
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
-from sliplab.rigs.mock.settings import EventCamera, ForceSensor, FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import (
+    MockEventCameraSettings,
+    MockForceSensorSettings,
+    MockFrameCameraSettings,
+    MockSettings,
+)
 from sliplab.rigs.mock.sync import ExposureLine, FreeRun, MockSyncBox
 from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.truth import clocks_of, readings_of, truth_of
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.streams import Sink
 
@@ -54,7 +59,7 @@ class Guarded:
         return call
 
 
-def on_cable(device: T, name: CabledDevice, world: World) -> T:
+def on_cable(device: T, name: CabledDevice, world: SimulatedWorld) -> T:
     """Wrap `device` so that calls fail while a fault disconnects it; unchanged without faults."""
     if not any(isinstance(f, DeviceGone) and f.device == name for f in world.settings.faults):
         return device
@@ -67,7 +72,7 @@ def on_cable(device: T, name: CabledDevice, world: World) -> T:
     return cast(T, Guarded(device, check))
 
 
-def on_stream_cable(device: T, name: str, world: World) -> T:
+def on_stream_cable(device: T, name: str, world: SimulatedWorld) -> T:
     """Wrap a further device as `on_cable` does, by the name of its stream."""
     if not any(isinstance(f, StreamGone) and f.stream == name for f in world.settings.faults):
         return device
@@ -82,7 +87,7 @@ def on_stream_cable(device: T, name: str, world: World) -> T:
     return cast(T, Guarded(device, check))
 
 
-def on_disk(sink: Sink, world: World) -> Sink:
+def on_disk(sink: Sink, world: SimulatedWorld) -> Sink:
     """Wrap `sink` so that writes fail once a fault fills the disk; unchanged without faults."""
     full = world.faults.of(DiskFull)
     if not full:
@@ -106,7 +111,7 @@ class MockDevices:
     sync: MockSyncBox
     plate: MockPlate
     operator: SimulatedOperator
-    world: World
+    world: SimulatedWorld
     timing: Timing
     force: MockForceSensor | None = None
     gripper: MockGripper | None = None
@@ -114,7 +119,7 @@ class MockDevices:
     """Further devices by the names of their streams."""
 
     def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
-        """Make the trial depend only on these and the program; see `World.begin_trial`."""
+        """Make the trial depend only on these and the program; see `SimulatedWorld.begin_trial`."""
         self.world.begin_trial(seed, nuisances)
 
     def sink(self, sink: Sink) -> Sink:
@@ -157,7 +162,7 @@ def build_mock(
         further: settings, timing and unit of each further device, by the name of its stream.
     """
     timing = timing or Timing()
-    world = World(settings)
+    world = SimulatedWorld(settings)
     free_run = None if timing.frames == "hardware trigger" else FreeRun(world)
     line = None
     if free_run is not None and timing.frames == "exposure line":
@@ -195,18 +200,18 @@ def _further(
     settings: Further,
     timing: StreamTiming,
     unit: str,
-    world: World,
+    world: SimulatedWorld,
     box: MockSyncBox,
 ) -> FurtherDevice:
     """Build a further device; its stream's unit is that of a scalar sensor."""
     if isinstance(settings, FurtherEventCamera):
-        seen = Identity[EventCamera](name, settings, settings.clock_ppm, settings.seed)
+        seen = Identity[MockEventCameraSettings](name, settings, settings.clock_ppm, settings.seed)
         return MockEventCamera(world, box, seen)
     if isinstance(settings, FurtherFrameCamera):
-        own = Identity[FrameCamera](name, settings, settings.clock_ppm, settings.seed)
+        own = Identity[MockFrameCameraSettings](name, settings, settings.clock_ppm, settings.seed)
         grade = cast(FrameGrade, timing.grade)  # checked against those of its kind
         trigger = box if grade == "hardware trigger" else FreeRun(world, own)
         return MockFrameCamera(world, trigger, grade, own)
-    if isinstance(settings, ForceSensor):
+    if isinstance(settings, MockForceSensorSettings):
         return MockForceSensor(world, settings, name)
     return MockThermometer(world, settings, name, unit)

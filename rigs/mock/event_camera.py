@@ -11,15 +11,15 @@ import numpy.typing as npt
 from sliplab.rigs.mock.clocks import HighestStamp
 from sliplab.rigs.mock.fault_settings import EventBurst, EventNoise
 from sliplab.rigs.mock.faults import NEVER
-from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.nuisances import brushing
-from sliplab.rigs.mock.settings import EventCamera
+from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 from sliplab.rigs.scene.randomness import generator
-from sliplab.rigs.scene.readout import Scans
+from sliplab.rigs.scene.readout import ScanTimes
 from sliplab.storage.streams import EventChunk, PulseChunk
 
 F64 = npt.NDArray[np.float64]
@@ -35,11 +35,11 @@ _BIN_NS, _LONG_BIN_NS = 1_000_000, 64_000_000
 class Bursts:
     """Events of `event_burst` and `event_noise`: Poisson in time, uniform over their pixels."""
 
-    def __init__(self, world: World, width: int, height: int) -> None:
+    def __init__(self, world: SimulatedWorld, width: int, height: int) -> None:
         self._world, self._width, self._height = world, width, height
         self._noisy: dict[tuple[int, int], I64] = {}
 
-    def into(self, events: Events, begin_ns: int, end_ns: int, scans: Scans) -> Events:
+    def into(self, events: Events, begin_ns: int, end_ns: int, scans: ScanTimes) -> Events:
         """Merge the burst's events into `events` of the interval `begin_ns` (excluded) to `end_ns`.
 
         Args:
@@ -51,7 +51,7 @@ class Bursts:
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
 
-    def between(self, begin_ns: int, end_ns: int, scans: Scans) -> Events:
+    def between(self, begin_ns: int, end_ns: int, scans: ScanTimes) -> Events:
         """Return only the burst's events, independent of how the interval is divided."""
         # a scan is delivered when its last column has been read
         begin_ns, end_ns = begin_ns - scans.reading_ns, end_ns - scans.reading_ns
@@ -130,13 +130,18 @@ class MockEventCamera:
     timed_by_host = False
 
     def __init__(
-        self, world: World, box: MockSyncBox, own: Identity[EventCamera] | None = None
+        self,
+        world: SimulatedWorld,
+        box: MockSyncBox,
+        own: Identity[MockEventCameraSettings] | None = None,
     ) -> None:
         self._world = world
         self._own = own or Identity("event_camera", world.settings.event_camera)
         settings = self._own.settings
         self.width, self.height = settings.width, settings.height
-        optics = EventOptics(**settings.model_dump(include=set(EventCamera.model_fields)))
+        optics = EventOptics(
+            **settings.model_dump(include=set(MockEventCameraSettings.model_fields))
+        )
         seed = self._own.fabrication_seed(world)
         self._sensor = MarkerSensor(optics, world.skin.layout_mm, seed)
         self._loads_of = "" if self._own.first else self._own.name
@@ -149,7 +154,7 @@ class MockEventCamera:
         self._running = False
         self._until_ns = 0
         self._next_ns = 0
-        self._loads: History | None = None
+        self._loads: GrowingTable | None = None
         self._stamps = HighestStamp()
         self.clock = self._own.clock(self._world)
 

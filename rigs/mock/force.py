@@ -14,9 +14,9 @@ import numpy.typing as npt
 from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import Mounting, RigError
 from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, faulty, undisturbed
-from sliplab.rigs.mock.history import History
-from sliplab.rigs.mock.settings import ForceSensor
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.history import GrowingTable
+from sliplab.rigs.mock.settings import MockForceSensorSettings
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.randomness import generator, key
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import WrenchChunk
@@ -44,7 +44,9 @@ class MockForceSensor:
     grade: ForceGrade = "host time"
     timed_by_host = False
 
-    def __init__(self, world: World, settings: ForceSensor, name: str = "") -> None:
+    def __init__(
+        self, world: SimulatedWorld, settings: MockForceSensorSettings, name: str = ""
+    ) -> None:
         self._world, self._settings, self._name = world, settings, name
         self.zeroing: Literal["trial", "session", "never"] = settings.bias
         seed = self._own(world.settings.seed if settings.seed is None else settings.seed)
@@ -75,7 +77,7 @@ class MockForceSensor:
         self._late = Lateness(seed, "force reception", settings.arrival_jitter_us)
         self._first = -(-self._cycles.to_reference(world.now_ns) // self._period_ns)
         self._read, self._arrived_ns = self._first, 0
-        self._loads: History | None = None
+        self._loads: GrowingTable | None = None
         self._until_ns: int | None = None
 
     def connect(self) -> None:
@@ -167,7 +169,7 @@ class MockForceSensor:
         return np.repeat([self._settings.noise_n, self._settings.noise_nm], 3)
 
 
-def _cross_talk(settings: ForceSensor, seed: int) -> F64:
+def _cross_talk(settings: MockForceSensorSettings, seed: int) -> F64:
     """Return the matrix C: given, or drawn."""
     if settings.cross_talk is not None:
         return np.array(settings.cross_talk)

@@ -19,9 +19,9 @@ from sliplab.rigs.mock.clocks import Jitter, Lateness
 from sliplab.rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.identity import Identity
-from sliplab.rigs.mock.settings import FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
 from sliplab.rigs.mock.sync import ClockReader, FreeRun, Ticks
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.frames import (
     ExposurePath,
     Exposures,
@@ -58,10 +58,10 @@ class MockFrameCamera:
 
     def __init__(
         self,
-        world: World,
+        world: SimulatedWorld,
         trigger: Ticks,
         grade: FrameGrade = "hardware trigger",
-        own: Identity[FrameCamera] | None = None,
+        own: Identity[MockFrameCameraSettings] | None = None,
     ) -> None:
         self._world, self._trigger = world, trigger
         self._own = own or Identity("frame_camera", world.settings.frame_camera)
@@ -236,7 +236,7 @@ def _blank_cut(place_px: F64, reach_px: F64, width: int, height: int) -> None:
                 place_px[k, i] = np.nan
 
 
-def _optics(settings: MockSettings, camera: FrameCamera) -> FrameOptics:
+def _optics(settings: MockSettings, camera: MockFrameCameraSettings) -> FrameOptics:
     plate = settings.scene.plate
     return FrameOptics(
         px_per_mm=camera.px_per_mm,
@@ -263,7 +263,7 @@ OUT_OF_SIGHT_MM = 500.0
 class FrameFaults:
     """The current trial's faults of the frame camera; a further one only loses sight of markers."""
 
-    def __init__(self, world: World, trigger: Ticks, *, first: bool = True) -> None:
+    def __init__(self, world: SimulatedWorld, trigger: Ticks, *, first: bool = True) -> None:
         self._world, self._trigger, self._first = world, trigger, first
 
     def lost(self, ticks: I64) -> Mask:

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from sliplab.protocols.yaml_file import StrictModel
 from sliplab.rigs.mock.settings import (
-    EventCamera,
     Finite,
-    ForceSensor,
-    FrameCamera,
+    MockEventCameraSettings,
+    MockForceSensorSettings,
+    MockFrameCameraSettings,
     NonNegative,
     Positive,
     Seed,
@@ -20,7 +20,7 @@ from sliplab.rigs.mock.settings import (
 Ppm = Annotated[float, Field(ge=0, le=20_000)]
 
 
-class FurtherEventCamera(EventCamera):
+class FurtherEventCamera(MockEventCameraSettings):
     """A further event camera in the sensor; it sees the same markers."""
 
     seed: Seed | None = None
@@ -29,7 +29,7 @@ class FurtherEventCamera(EventCamera):
     """Largest drift of its clock, either way."""
 
 
-class FurtherFrameCamera(FrameCamera):
+class FurtherFrameCamera(MockFrameCameraSettings):
     """A further camera that looks through the plate."""
 
     seed: Seed | None = None
@@ -59,4 +59,4 @@ class Thermometer(StrictModel):
     """Delay besides; half-normal, up to this limit of four sigma."""
 
 
-Further = FurtherEventCamera | FurtherFrameCamera | ForceSensor | Thermometer
+Further = FurtherEventCamera | FurtherFrameCamera | MockForceSensorSettings | Thermometer

@@ -7,14 +7,14 @@ import numpy as np
 from sliplab.rigs.core.capabilities import GripperState, RigError
 from sliplab.rigs.core.gripper_check import check_move
 from sliplab.rigs.core.gripper_range import GripperRange
-from sliplab.rigs.mock.settings import Gripper
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.settings import MockGripperSettings
+from sliplab.rigs.mock.world import SimulatedWorld
 
 
 class MockGripper:
     """A gripper that reacts after a delay; its fingers stall at the force of their move."""
 
-    def __init__(self, world: World, settings: Gripper) -> None:
+    def __init__(self, world: SimulatedWorld, settings: MockGripperSettings) -> None:
         assert world.fingers is not None
         self._world, self._fingers, self._connected = world, world.fingers, False
         self.range = GripperRange(settings.range_mm, settings.speed_mm_s, settings.force_n)

@@ -17,7 +17,7 @@ memory."""
 _FEW = 512
 
 
-class History:
+class GrowingTable:
     """A growing table of rows at increasing times; add a row before reading."""
 
     def __init__(self, width: int) -> None:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from sliplab.rigs.mock.settings import EventCamera, FrameCamera
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.settings import MockEventCameraSettings, MockFrameCameraSettings
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.randomness import key
 from sliplab.storage.clockmap import ClockMap
 
-SettingsT = TypeVar("SettingsT", EventCamera, FrameCamera)
+SettingsT = TypeVar("SettingsT", MockEventCameraSettings, MockFrameCameraSettings)
 _SEEDS = 2**63
 
 
@@ -39,16 +39,16 @@ class Identity(Generic[SettingsT]):
         """True for the rig's first camera of its kind, which faults may hit."""
         return self.clock_ppm is None
 
-    def fabrication_seed(self, world: World) -> int:
+    def fabrication_seed(self, world: SimulatedWorld) -> int:
         """Return the seed of what does not change from trial to trial."""
         seed = world.settings.seed if self.seed is None else self.seed
         return seed if self.first else key(seed, f"stream {self.name}") % _SEEDS
 
-    def trial_seed(self, world: World) -> int:
+    def trial_seed(self, world: SimulatedWorld) -> int:
         """Return the seed of what a trial draws."""
         return world.seed if self.first else key(world.seed, f"stream {self.name}") % _SEEDS
 
-    def clock(self, world: World) -> ClockMap:
+    def clock(self, world: SimulatedWorld) -> ClockMap:
         """Return the map from true time to the camera's clock in the running trial."""
         if self.clock_ppm is not None:
             return world.further_clock(self.name, self.clock_ppm)

@@ -14,12 +14,12 @@ import numpy.typing as npt
 from sliplab.protocols.nuisances import (
     AnyNuisance,
     Brush,
-    Flicker,
+    FlickerNuisance,
     HotPixels,
     LostPackets,
     Tap,
     TrialNuisances,
-    Vibration,
+    VibrationNuisance,
     Warmth,
 )
 from sliplab.rigs.mock.fault_settings import (
@@ -32,7 +32,7 @@ from sliplab.rigs.mock.fault_settings import (
     SkinBrushed,
 )
 from sliplab.rigs.mock.faults import FaultBook
-from sliplab.rigs.mock.settings import EventCamera
+from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
@@ -45,7 +45,9 @@ DAMPING = 0.05
 """Of the oscillation after a knock, over critical damping."""
 
 
-def faults_of(nuisances: TrialNuisances, camera: EventCamera, seed: int) -> list[AnyFault]:
+def faults_of(
+    nuisances: TrialNuisances, camera: MockEventCameraSettings, seed: int
+) -> list[AnyFault]:
     """Return the faults that simulate a trial's nuisances; those of the arm have none.
 
     Args:
@@ -66,14 +68,16 @@ def faults_of(nuisances: TrialNuisances, camera: EventCamera, seed: int) -> list
     return found
 
 
-def _maker(nuisance: AnyNuisance, camera: EventCamera) -> Callable[[float], AnyFault] | None:
+def _maker(
+    nuisance: AnyNuisance, camera: MockEventCameraSettings
+) -> Callable[[float], AnyFault] | None:
     """Make the fault of a nuisance from its time, s."""
     match nuisance:
         case Tap():
             return lambda at_s: Knock(
                 kind="knock", at_s=at_s, um=1000 * float(nuisance.distance), hz=float(nuisance.ring)
             )
-        case Vibration():
+        case VibrationNuisance():
             return lambda at_s: Shaking(
                 kind="shaking",
                 at_s=at_s,
@@ -82,7 +86,7 @@ def _maker(nuisance: AnyNuisance, camera: EventCamera) -> Callable[[float], AnyF
                 high_hz=float(nuisance.high),
                 sweep_s=float(nuisance.sweep),
             )
-        case Flicker():
+        case FlickerNuisance():
             return lambda at_s: MainsLight(
                 kind="mains_light",
                 at_s=at_s,

@@ -11,7 +11,7 @@ from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.operators import mass_of
 from sliplab.rigs.mock.path import matrix, rotvec_deg
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.lens import VIEWS
 from sliplab.rigs.scene.randomness import generator
 
@@ -25,7 +25,7 @@ class VirtualClock:
     It starts at 0 with every trial, so that host times in a recording depend only on the trial.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
 
     def now_ns(self) -> int:
@@ -42,7 +42,7 @@ class VirtualClock:
 class MockPlate:
     """The plate on its slider."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
 
     def act(self, action: PlateAction, seconds: float) -> None:
@@ -78,7 +78,7 @@ class SimulatedOperator:
     temperature), are only confirmed.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
         self.asked: list[OperatorRequest] = []
 
@@ -116,7 +116,7 @@ _TOUCHED = {
 _SPEED_MM_S = 20.0
 
 
-def jog(world: World, expected: str) -> bool:
+def jog(world: SimulatedWorld, expected: str) -> bool:
     """Move the tip as `expected` says (``touched right``, ``pivot 3``); others do nothing.
 
     Returns:
@@ -140,7 +140,7 @@ def jog(world: World, expected: str) -> bool:
     return True
 
 
-def _pivoted(world: World, number: int) -> Pose:
+def _pivoted(world: SimulatedWorld, number: int) -> Pose:
     """Return a pose with the tip on the pin, tilted in another direction for each number."""
     tilt, azimuth = np.radians(25.0), np.radians(100.0 * number)
     tilted = matrix(
@@ -156,7 +156,7 @@ def _pivoted(world: World, number: int) -> Pose:
     return Pose((x, y, z), rotvec_deg(tool))
 
 
-def hold_board(world: World, expected: str) -> None:
+def hold_board(world: SimulatedWorld, expected: str) -> None:
     """Hold up the board for a request such as ``view 3``, or remove it."""
     what, _, which = expected.partition(" ")
     world.board = VIEWS[int(which) % len(VIEWS)] if what == "view" and which.isdigit() else None

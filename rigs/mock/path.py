@@ -18,7 +18,7 @@ from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.core.fake_motion import Ramp
 from sliplab.rigs.mock.fault_settings import ArmOffPath
 from sliplab.rigs.mock.faults import NEVER, FaultBook
-from sliplab.rigs.mock.settings import Contact
+from sliplab.rigs.mock.settings import PlatePosition
 
 F64 = npt.NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def rotvec_deg(rotation: F64) -> tuple[float, float, float]:
     return x, y, z
 
 
-class ContactPlane:
+class TrueSurface:
     """The true surface of the plate in the arm's base frame: x right, y up, z into the plate.
 
     These axes are right-handed as the outside camera sees them, from behind.
@@ -67,7 +67,9 @@ class ContactPlane:
         self.tip_mm = np.zeros(3) if tip_mm is None else tip_mm
 
     @classmethod
-    def from_settings(cls, contact: Contact, tip_mm: Sequence[float] = (0, 0, 0)) -> ContactPlane:
+    def from_settings(
+        cls, contact: PlatePosition, tip_mm: Sequence[float] = (0, 0, 0)
+    ) -> TrueSurface:
         """Tilt the nominal plane about an axis in it, and offset it along its normal."""
         nominal = matrix(contact.nominal_rotvec_deg)
         azimuth = math.radians(contact.tilt_axis_deg)
@@ -111,11 +113,11 @@ _X, _Y, _DEPTH = 6, 7, 8
 """Columns of an arm state: the sensor's position on the plate, and its depth."""
 
 
-class Deviation:
+class ToolDeviation:
     """Deviation of the tool from its commanded position, as an arm state to be added."""
 
     def __init__(
-        self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
+        self, book: FaultBook, plane: TrueSurface, commanded: Callable[[I64], F64]
     ) -> None:
         """`commanded`: maps increasing true times, ns, (n,) to states, (n, 12)."""
         self._book, self._plane, self._commanded = book, plane, commanded
@@ -203,11 +205,11 @@ class ArmPath:
         ramp_mm_s2: acceleration of legs that begin or end in contact; infinite without ramps.
     """
 
-    def __init__(self, plane: ContactPlane, pose: Pose) -> None:
+    def __init__(self, plane: TrueSurface, pose: Pose) -> None:
         self._plane = plane
         self._rest = self._state(pose)
         self.legs: list[Leg] = []
-        self.deviation: Deviation | None = None
+        self.deviation: ToolDeviation | None = None
         self.ramp_mm_s2 = math.inf
 
     def restart(self, now_ns: int) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.finger_motion import FingerMotion
 from sliplab.rigs.mock.faults import NEVER
-from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.scene.contact import advance
 from sliplab.rigs.scene.friction import friction_knots
@@ -78,11 +78,11 @@ class Physics:
         if spots is not None:
             self.springs = replace(self.springs, spots=spots)
         self.tips: Tips = new_tips(len(skin))
-        self.track = History(track_width(len(skin)))
-        self.loads: History | None = None
-        self.more_loads: dict[str, History] = {}
-        self.wrench: History | None = None
-        self.more_wrenches: dict[str, History] = {}
+        self.track = GrowingTable(track_width(len(skin)))
+        self.loads: GrowingTable | None = None
+        self.more_loads: dict[str, GrowingTable] = {}
+        self.wrench: GrowingTable | None = None
+        self.more_wrenches: dict[str, GrowingTable] = {}
         self.plate_free = False
         self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
         self._plate_motion = np.zeros(2)
@@ -256,7 +256,7 @@ class Physics:
 
     # -- state for devices -----------------------------------------------------------------
 
-    def keep_loads(self, now_ns: int, camera: str = "") -> History:
+    def keep_loads(self, now_ns: int, camera: str = "") -> GrowingTable:
         """Record the forces of every row from now on, until `loads` is reset.
 
         Args:
@@ -264,7 +264,7 @@ class Physics:
         """
         self._catch_up(now_ns)
         tips = self.tips
-        loads = History(3 * len(tips.state))
+        loads = GrowingTable(3 * len(tips.state))
         row = loads.grow(np.array([self.track.end_ns], np.int64))[0]
         row[:] = np.column_stack([tips.force, tips.normal]).ravel()
         if camera:
@@ -273,14 +273,14 @@ class Physics:
             self.loads = loads
         return loads
 
-    def keep_wrench(self, now_ns: int, sensor: str = "") -> History:
+    def keep_wrench(self, now_ns: int, sensor: str = "") -> GrowingTable:
         """Keep the sum of the forces of every row from the present on.
 
         Args:
             sensor: name of a further force sensor: its record is among `more_wrenches`.
         """
         self._catch_up(now_ns)
-        wrench = History(6)
+        wrench = GrowingTable(6)
         last_ns = np.array([self.track.end_ns], np.int64)
         load = np.column_stack([self.tips.force, self.tips.normal]).reshape(1, -1)
         wrench.grow(last_ns)[:] = plate_wrench(self.track.at(last_ns), load)

@@ -41,7 +41,7 @@ MOST_PAPILLAE = 1_000
 """Of a simulated skin: memory and time grow with the square; sensors have up to some hundred."""
 
 
-class Skin(StrictModel):
+class SkinSettings(StrictModel):
     """The papillae: a centre and two rings, lower towards the outside."""
 
     seed: Seed | None = None
@@ -78,7 +78,7 @@ class Skin(StrictModel):
             raise KeyedError(".ring_counts", f"{len(self.ring_counts)} layers", text)
 
     @rule
-    def _layers(self) -> Skin:
+    def _layers(self) -> SkinSettings:
         if self.papillae is not None and len(self.papillae) != sum(self.ring_counts):
             raise KeyedError(
                 "mock.scene.skin.papillae",
@@ -110,7 +110,7 @@ class Friction(StrictModel):
     """Relative standard deviation between papillae (fabrication), clipped at two sigma."""
 
 
-class Plate(StrictModel):
+class MockPlateSettings(StrictModel):
     """The sliding plate of gravity trials, its slider and its marker."""
 
     mass_kg: Positive = 0.205
@@ -129,7 +129,7 @@ class Plate(StrictModel):
     """Position in plate coordinates; in a region of 41.6 mm, clear of the skin after any fall."""
 
 
-class Contact(StrictModel):
+class PlatePosition(StrictModel):
     """The plate's true position in the arm's base frame, which teaching must find."""
 
     nominal_origin_mm: Triple = (400.0, 0.0, 300.0)
@@ -142,7 +142,7 @@ class Contact(StrictModel):
     """Distance of the true surface behind the nominal one, along its normal."""
 
     @rule
-    def _turn(self) -> Contact:
+    def _turn(self) -> PlatePosition:
         if math.hypot(*self.nominal_rotvec_deg) > 360.0:
             raise KeyedError(
                 "mock.scene.contact.nominal_rotvec_deg",
@@ -152,20 +152,20 @@ class Contact(StrictModel):
         return self
 
 
-class Scene(StrictModel):
+class SceneSettings(StrictModel):
     """The physics of the scene, independent of the devices."""
 
     level: Literal["auto", "L1", "L2", "L3"] = "auto"
     """Physics level of the contact (`rigs.scene.springs`); `auto` uses the level a plan needs."""
     step_ms: Literal[1, 2, 4, 8, 16, 32] = 2
     """Time step of the contact while the plate is held; 1 ms while it may fall."""
-    skin: Skin = Skin()
+    skin: SkinSettings = SkinSettings()
     friction: Friction = Friction()
-    plate: Plate = Plate()
-    contact: Contact = Contact()
+    plate: MockPlateSettings = MockPlateSettings()
+    contact: PlatePosition = PlatePosition()
 
 
-class EventCamera(StrictModel):
+class MockEventCameraSettings(StrictModel):
     """The event camera inside the sensor and the markers that it sees."""
 
     width: Annotated[int, Field(ge=64, le=4096)] = 640
@@ -216,7 +216,7 @@ class EventCamera(StrictModel):
     """Interpolation of markers between two steps of the contact: smooth, or straight."""
 
     @rule
-    def _scans(self) -> EventCamera:
+    def _scans(self) -> MockEventCameraSettings:
         if 0 < self.readout_hz < 1000:
             raise KeyedError(
                 "mock.event_camera.readout_hz",
@@ -226,7 +226,7 @@ class EventCamera(StrictModel):
         return self
 
 
-class Reflections(StrictModel):
+class ReflectionSettings(StrictModel):
     """Static reflections in the acrylic, which disturb the labels.
 
     At the default level onsets shift by a few milliseconds. Above about 40 (a quarter of the
@@ -244,7 +244,7 @@ class Reflections(StrictModel):
 Tilt = Annotated[float, Field(ge=-30, le=30)]
 
 
-class FrameCamera(StrictModel):
+class MockFrameCameraSettings(StrictModel):
     """The camera that sees the skin through the plate."""
 
     level: Literal["video", "tracks"] = "video"
@@ -270,7 +270,7 @@ class FrameCamera(StrictModel):
     ground_level: Annotated[int, Field(ge=15, le=255)] = 25
     noise: Annotated[float, Field(ge=0, le=3)] = 1.5
     """Standard deviation of the grey levels, in patches around the evaluated features."""
-    reflections: Reflections = Reflections()
+    reflections: ReflectionSettings = ReflectionSettings()
     centroid_noise_px: NonNegative = 0.0045
     """Root mean square error of a tracked papilla's column and row at the level `tracks`; measured
     at the level `video` with the settings above, along a slide."""
@@ -284,7 +284,7 @@ class FrameCamera(StrictModel):
     (`timing.frames: host arrival`); half-normal, up to this limit of four sigma."""
 
 
-class Arm(StrictModel):
+class MockArmSettings(StrictModel):
     """The arm and its controller."""
 
     pose_rate_hz: Annotated[float, Field(gt=0, le=10_000)] = 500.0
@@ -310,7 +310,7 @@ class Arm(StrictModel):
 Row = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
-class ForceSensor(StrictModel):
+class MockForceSensorSettings(StrictModel):
     """A force/torque sensor behind the plate: the contact's true forces, and its own faults.
 
     Axes: x right, y up, z into the plate; torques are about the plate's centre. The defaults are
@@ -346,7 +346,7 @@ class ForceSensor(StrictModel):
     """When the present reading becomes zero."""
 
 
-class Gripper(StrictModel):
+class MockGripperSettings(StrictModel):
     """Fingers that press the sensor deeper into contact as they close.
 
     The defaults are those of an adaptive parallel gripper with a stroke of 85 mm, as its maker
@@ -366,7 +366,7 @@ class Gripper(StrictModel):
     """From a command to the beginning of its motion."""
 
     @rule
-    def _in_range(self) -> Gripper:
+    def _in_range(self) -> MockGripperSettings:
         for name in ("range_mm", "speed_mm_s", "force_n"):
             low, high = getattr(self, name)
             if low >= high:
@@ -378,7 +378,7 @@ class Gripper(StrictModel):
         return self
 
 
-class Clocks(StrictModel):
+class ClockErrors(StrictModel):
     """Errors of the devices' clocks. Drifts are a property of the rig."""
 
     arm_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
@@ -401,7 +401,7 @@ class Clocks(StrictModel):
     """Limit at which this time is clipped."""
 
     @rule
-    def _reads(self) -> Clocks:
+    def _reads(self) -> ClockErrors:
         if self.read_longest_us < self.read_shortest_us:
             raise KeyedError(
                 "mock.clocks.read_longest_us",
@@ -416,15 +416,15 @@ class MockSettings(StrictModel):
 
     seed: Seed = 1
     """Seed of fabrication scatter, contrast thresholds and clock drifts, which identify the rig."""
-    scene: Scene = Scene()
-    event_camera: EventCamera = EventCamera()
-    frame_camera: FrameCamera = FrameCamera()
-    arm: Arm = Arm()
-    force: ForceSensor | None = None
+    scene: SceneSettings = SceneSettings()
+    event_camera: MockEventCameraSettings = MockEventCameraSettings()
+    frame_camera: MockFrameCameraSettings = MockFrameCameraSettings()
+    arm: MockArmSettings = MockArmSettings()
+    force: MockForceSensorSettings | None = None
     """Left out, the rig has no force sensor; `{}` is one with its defaults."""
-    gripper: Gripper | None = None
+    gripper: MockGripperSettings | None = None
     """Left out, the rig has no gripper; `{}` is one with its defaults."""
-    clocks: Clocks = Clocks()
+    clocks: ClockErrors = ClockErrors()
     faults: tuple[Fault, ...] = ()
     """Faults to inject; docs/faults.md lists the kinds."""
 
@@ -500,7 +500,7 @@ def check_timing(mock: MockSettings, timing: Timing, force_of_arm: bool = False)
         )
 
 
-def _check_force(force: ForceSensor, timing: Timing) -> None:
+def _check_force(force: MockForceSensorSettings, timing: Timing) -> None:
     """Hold a simulated force sensor's clock and delay against `timing.force`."""
     how = timing.force or ForceTiming()
     if how.grade != "host time":

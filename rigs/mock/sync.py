@@ -23,8 +23,8 @@ from sliplab.rigs.mock.fault_settings import (
 )
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.identity import Identity
-from sliplab.rigs.mock.settings import FrameCamera
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.settings import MockFrameCameraSettings
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import ClockReads, PulseChunk
@@ -44,7 +44,7 @@ class Ticks:
         stopped_ns: true time after which there are no ticks; None while they continue.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
         self.run = 0
         self._clear()
@@ -115,7 +115,9 @@ class FreeRun(Ticks):
         own: the camera; the rig's first one by default.
     """
 
-    def __init__(self, world: World, own: Identity[FrameCamera] | None = None) -> None:
+    def __init__(
+        self, world: SimulatedWorld, own: Identity[MockFrameCameraSettings] | None = None
+    ) -> None:
         self._own = own or Identity("frame_camera", world.settings.frame_camera)
         super().__init__(world)
 
@@ -148,7 +150,7 @@ class ExposureLine:
     A frame that is lost in transfer was exposed all the same.
     """
 
-    def __init__(self, world: World, camera: FreeRun) -> None:
+    def __init__(self, world: SimulatedWorld, camera: FreeRun) -> None:
         self._world, self._camera = world, camera
         self._begin()
         world.at_begin(self._begin)
@@ -185,7 +187,7 @@ class ClockReader:
     a fraction of a millisecond; the next request starts after the previous answer.
     """
 
-    def __init__(self, world: World, device: str) -> None:
+    def __init__(self, world: SimulatedWorld, device: str) -> None:
         self._world, self._device = world, device
         self._begin()
         world.at_begin(self._begin)
@@ -221,7 +223,7 @@ class MockSyncBox(Ticks):
         exposures: the frame camera's output; None where it is not wired.
     """
 
-    def __init__(self, world: World, exposures: ExposureLine | None = None) -> None:
+    def __init__(self, world: SimulatedWorld, exposures: ExposureLine | None = None) -> None:
         self._exposures = exposures
         self._clock_reader = ClockReader(world, "sync_box")
         super().__init__(world)
@@ -299,7 +301,7 @@ class MockSyncBox(Ticks):
 class SyncInput:
     """A device's input on the sync line: its edges in true time with the device's jitter."""
 
-    def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
+    def __init__(self, world: SimulatedWorld, box: MockSyncBox, device: str) -> None:
         self._world, self._box, self._device = world, box, device
         self._reset()
         world.at_begin(self._reset)
@@ -338,7 +340,7 @@ class SyncInput:
 class _PulseFaults:
     """Faults of the pulses of one train in one device."""
 
-    def __init__(self, world: World, box: MockSyncBox, device: str) -> None:
+    def __init__(self, world: SimulatedWorld, box: MockSyncBox, device: str) -> None:
         self._box = weakref.proxy(box)  # which has its own
         self._device, self._book = device, world.faults
         self._waiting = np.empty((2, 0), np.int64)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.mock.clocks import Lateness, Noise
 from sliplab.rigs.mock.further_settings import Thermometer
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.scene.randomness import generator, key
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.streams import ScalarChunk
@@ -23,7 +23,7 @@ class MockThermometer:
     timed_by_host = True
     clock: ClockMap = IDENTITY
 
-    def __init__(self, world: World, settings: Thermometer, name: str, unit: str) -> None:
+    def __init__(self, world: SimulatedWorld, settings: Thermometer, name: str, unit: str) -> None:
         self._world, self._settings, self._name, self.unit = world, settings, name, unit
         self._period_ns = round(1e9 / settings.rate_hz)
         self._begin()

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, TrueOnsets, Truth
 from sliplab.rigs.mock.faults import NEVER
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.kernels import njit
 
@@ -23,7 +23,7 @@ SLIP_MM = 1e-6
 
 
 def truth_of(
-    world: World,
+    world: SimulatedWorld,
     box: ClockMap,
     reference_true_ns: int,
     threshold_px: float = 2.0,
@@ -73,12 +73,12 @@ COURSE = "plate course"
 _COURSE_NS = 1_000_000
 
 
-def watch_plate(world: World) -> None:
+def watch_plate(world: SimulatedWorld) -> None:
     """Keep the forces on the plate from now on, for `plate_course`."""
     world.keep_wrench(COURSE)
 
 
-def plate_course(world: World, since_true_ns: int) -> PlateCourse:
+def plate_course(world: SimulatedWorld, since_true_ns: int) -> PlateCourse:
     """Return heights, normal forces and depths every millisecond since a true time.
 
     Raises:
@@ -98,7 +98,7 @@ def plate_course(world: World, since_true_ns: int) -> PlateCourse:
     }
 
 
-def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
+def _moved_mm(world: SimulatedWorld, start_ns: int, end_ns: int) -> list[float]:
     """Return each marker's displacement on the plate from one true time to another."""
     n = len(world.physics.tips.state)
     places = world.physics.track.at(np.array([start_ns, end_ns], np.int64))[:, : 2 * n]
@@ -107,7 +107,7 @@ def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
 
 
 def _counted_from(
-    world: World, box: ClockMap, reference_true_ns: int, threshold_mm: float
+    world: SimulatedWorld, box: ClockMap, reference_true_ns: int, threshold_mm: float
 ) -> TrueOnsets:
     """Return the onsets after a true time, with displacements from then; see `truth_of`."""
     history = world.physics.track
@@ -146,7 +146,7 @@ def _counted_from(
 
 
 def clocks_of(
-    world: World, box: ClockMap, recorded_ns: tuple[int, int], frames: FrameGrade
+    world: SimulatedWorld, box: ClockMap, recorded_ns: tuple[int, int], frames: FrameGrade
 ) -> dict[str, list[list[int]]]:
     """Return the readings of the clocks at every second of a recording, without jitter.
 

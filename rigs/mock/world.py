@@ -20,17 +20,17 @@ from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.finger_motion import FingerMotion
-from sliplab.rigs.mock.clocks import TrialClocks, own_clock, shifted, trial_clocks, with_faults
+from sliplab.rigs.mock.clocks import ClockMaps, own_clock, shifted, trial_clocks, with_faults
 from sliplab.rigs.mock.fault_settings import PlateStuck
 from sliplab.rigs.mock.faults import FaultBook
-from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.nuisances import Shake, faults_of
-from sliplab.rigs.mock.path import SENSOR, ArmPath, ContactPlane, Deviation, Leg
+from sliplab.rigs.mock.path import SENSOR, ArmPath, Leg, ToolDeviation, TrueSurface
 from sliplab.rigs.mock.physics import Physics
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.lens import BoardPlace
 from sliplab.rigs.scene.skin import Skin
-from sliplab.rigs.scene.vibration import Vibration
+from sliplab.rigs.scene.vibration import ArmVibration
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
@@ -43,7 +43,7 @@ NEAR_MM = 5.0
 
 def start_pose(settings: MockSettings) -> Pose:
     """Return the arm's pose at power-on."""
-    plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+    plane = TrueSurface.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
     start = plane.pose(0.0, 0.0, -CLEARANCE_MM)
     if settings.arm.start_xyz_mm is not None:
         return Pose(settings.arm.start_xyz_mm, start.rotvec_deg)
@@ -58,7 +58,7 @@ def fingers_of(settings: MockSettings) -> FingerMotion | None:
     return FingerMotion(made.opening_mm, made.reaction_us * 1000, made.acceleration_mm_s2)
 
 
-class World:
+class SimulatedWorld:
     """The simulated world, which only simulated devices access.
 
     Attributes:
@@ -81,7 +81,7 @@ class World:
     ) -> None:
         self.settings, self._run_on = settings, run_on
         self.skin: Skin = skin_of(settings)
-        self.plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+        self.plane = TrueSurface.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self.mass_kg = settings.scene.plate.mass_kg
         self.now_ns = self.past_ns = 0
         self.trials = 0
@@ -140,12 +140,12 @@ class World:
         )
         if self._run_on:
             clocks = clocks.after(self.past_ns)
-        self.clocks: TrialClocks = with_faults(clocks, self.faults)
+        self.clocks: ClockMaps = with_faults(clocks, self.faults)
         self.path.ramp_mm_s2 = self.faults.ramp_mm_s2()
-        self.path.deviation = Deviation(self.faults, self.plane, self.path.commanded)
+        self.path.deviation = ToolDeviation(self.faults, self.plane, self.path.commanded)
         here = self.path.commanded(np.array([self.now_ns], np.int64), SENSOR)[0]
         self._straight_rad = float(here[5])
-        self._vibration = Vibration(
+        self._vibration = ArmVibration(
             settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
         )
         self._shake = Shake(self.faults, seed)
@@ -277,7 +277,7 @@ class World:
 
     # -- state for devices -----------------------------------------------------------------
 
-    def keep_loads(self, camera: str = "") -> History:
+    def keep_loads(self, camera: str = "") -> GrowingTable:
         """Record the forces of every row from the last one on, until `drop_loads`.
 
         Args:
@@ -285,7 +285,7 @@ class World:
         """
         return self.physics.keep_loads(self.now_ns, camera)
 
-    def keep_wrench(self, sensor: str = "") -> History:
+    def keep_wrench(self, sensor: str = "") -> GrowingTable:
         """Keep the sum of the forces of every row from the last one on, until the trial ends.
 
         Args:

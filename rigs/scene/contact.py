@@ -110,7 +110,7 @@ ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
 
 
-class Step(NamedTuple):
+class ContactStep(NamedTuple):
     """A step of the solver in which sensor and plate move linearly."""
 
     h: float
@@ -188,7 +188,14 @@ def feel_spots(blocks: Blocks, n: int, clean: F64, field: F64, spots: F64, facto
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def respond(
-    w: Block, field: F64, law: Law, first: int, count: int, sensor: F64, plate_y: float, step: Step
+    w: Block,
+    field: F64,
+    law: Law,
+    first: int,
+    count: int,
+    sensor: F64,
+    plate_y: float,
+    step: ContactStep,
 ) -> None:
     """Find how a block's tips end a step; the state stays.
 
@@ -198,7 +205,7 @@ def respond(
         sensor: x, y, depth (mm) at the end of the step, and the two slopes of depth, (5,); if the
             sensor turns about the plate's normal its angle, rad, is a sixth number.
         plate_y: height of the plate at the end of the step, mm.
-        step: `Step`.
+        step: `ContactStep`.
     """
     turn = sensor[5] if sensor.shape[0] > 5 else 0.0
     stale, touching = _approach(
@@ -242,7 +249,7 @@ def _approach(
     cosine: float,
     sine: float,
     plate_y: float,
-    step: Step,
+    step: ContactStep,
 ) -> tuple[int, int]:
     """Move the bases, and begin to seek the bends.
 
@@ -290,7 +297,7 @@ def _touches_at(was: float, deep: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _touch(w: Block, law: Law, j: int, step: Step) -> None:
+def _touch(w: Block, law: Law, j: int, step: ContactStep) -> None:
     """Place a tip that meets the plate in this step under its base at that moment."""
     was, gain = w.indentation[j], step.gain
     w.foot_x[j], w.foot_y[j] = w.to_x[j], w.to_y[j]
@@ -329,7 +336,7 @@ def _bend(w: Block) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _decide(w: Block, law: Law, step: Step) -> tuple[int, int]:
+def _decide(w: Block, law: Law, step: ContactStep) -> tuple[int, int]:
     """Find the forces if all tips stick, and which tips do.
 
     Returns:
@@ -411,7 +418,9 @@ def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _slide(w: Block, field: F64, law: Law, first: int, count: int, step: Step, rare: int) -> None:
+def _slide(
+    w: Block, field: F64, law: Law, first: int, count: int, step: ContactStep, rare: int
+) -> None:
     """Slide the tips with `end_mode` sliding; `rare`: how many are prepared one by one."""
     rough = field.shape[1] > 1
     if rare > 0:
@@ -501,7 +510,7 @@ def _aim(w: Block, law: Law) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _begin(w: Block, law: Law, rough: bool, step: Step) -> None:
+def _begin(w: Block, law: Law, rough: bool, step: ContactStep) -> None:
     """Begin the search of every slip where its earlier speeds lead."""
     per_s = 1.0 / step.h
     for j in range(LANES):
@@ -519,7 +528,7 @@ def _begin_search(
     slides: float,
     rough: bool,
     per_s: float,
-    step: Step,
+    step: ContactStep,
 ) -> None:
     """Begin to seek a slip, given the speed at its end (see `strengthened`) and a guess of it."""
     new_x, new_y = w.to_x[j] - w.foot_x[j], w.to_y[j] - w.foot_y[j]
@@ -678,7 +687,7 @@ def _pull(w: Block, law: Law) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _let_go(w: Block, law: Law, j: int, step: Step) -> None:
+def _let_go(w: Block, law: Law, j: int, step: ContactStep) -> None:
     """Find when in the step a tip lets go, and with which force its slip begins."""
     grip, _ = grip_between(w.path[j], w.knot[j], w.c0[j], w.c1[j], w.c2[j], w.c3[j])
     static, before, after = 1.0 + law.static_excess, grip * w.normal[j], grip * w.end_normal[j]
@@ -701,7 +710,7 @@ def _let_go(w: Block, law: Law, j: int, step: Step) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lets_go_at(guess: float, w: Block, law: Law, j: int, limit: float, step: Step) -> float:
+def _lets_go_at(guess: float, w: Block, law: Law, j: int, limit: float, step: ContactStep) -> float:
     """Share of a step at which a stuck tip's force meets its cone: a root of the law itself.
 
     While a tip sticks its force is a known function of time, relaxation included, so that the
@@ -731,7 +740,7 @@ def _lets_go_at(guess: float, w: Block, law: Law, j: int, limit: float, step: St
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _excess(share: float, w: Block, law: Law, j: int, limit: float, step: Step) -> float:
+def _excess(share: float, w: Block, law: Law, j: int, limit: float, step: ContactStep) -> float:
     """Force less `limit` times normal force of a tip that has stuck up to a share of a step, N."""
     h, swerve = step.h, step.swerve
     decay, gain = relaxing(max(share * h, 1e-12), law.relaxation_s)
@@ -756,7 +765,9 @@ def _excess(share: float, w: Block, law: Law, j: int, limit: float, step: Step) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _begin_rare(w: Block, field: F64, law: Law, i: int, j: int, rough: bool, step: Step) -> None:
+def _begin_rare(
+    w: Block, field: F64, law: Law, i: int, j: int, rough: bool, step: ContactStep
+) -> None:
     """Begin to seek the slip of tip `i` in lane `j`, which lets go or slows down fast."""
     before, after = w.before[j], w.after[j]
     if w.rare[j] == _LETS_GO:
@@ -874,7 +885,7 @@ def move_tips(
     sensor: F64,
     plate_y: float,
     start_s: float,
-    step: Step,
+    step: ContactStep,
 ) -> None:
     """Advance every tip by one step; `start_s`: when it begins, s; see `respond`."""
     for k in range(blocks.shape[0]):
@@ -928,13 +939,13 @@ def advance(
     field, factors = friction, np.ones(n)
     if spots.shape[0] > 0:
         field = friction.copy()
-    step_ns, step = np.int64(0), Step(0.0, 1.0, 1.0, 0.0)
+    step_ns, step = np.int64(0), ContactStep(0.0, 1.0, 1.0, 0.0)
     for k in range(sensor.shape[0]):
         if t_ns[k + 1] - t_ns[k] != step_ns:
             step_ns = t_ns[k + 1] - t_ns[k]
             h = step_ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
-            step = Step(h, decay, gain, 0.0)
+            step = ContactStep(h, decay, gain, 0.0)
         if spots.shape[0] > 0:
             feel_spots(blocks, n, friction, field, spots, factors)
         move_tips(blocks, n, field, law, sensor[k], plate_y[k + 1], t_ns[k] * 1e-9, step)

@@ -29,7 +29,7 @@ from sliplab.rigs.scene.circuit import (
     start_cells,
 )
 from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, memorise_discs, widen
-from sliplab.rigs.scene.flicker import Flicker, flicker_events, new_flicker, steady
+from sliplab.rigs.scene.flicker import FlickeringLight, flicker_events, new_flicker, steady
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
     cut_block,
@@ -59,7 +59,7 @@ from sliplab.rigs.scene.pixels import (
     pack_steps,
 )
 from sliplab.rigs.scene.randomness import generator
-from sliplab.rigs.scene.readout import NEVER_NS, Scans, larger, read_each, read_scans
+from sliplab.rigs.scene.readout import NEVER_NS, ScanTimes, larger, read_each, read_scans
 from sliplab.rigs.scene.rim_pixels import (
     REACH_PX,
     RimLists,
@@ -130,7 +130,7 @@ class EventOptics:
         return min(self.scan_us * 1e3, self.period_ns) / self.width
 
 
-class Camera(NamedTuple):
+class CameraKernel(NamedTuple):
     """Settings of the camera that the kernel takes; fields as in `EventOptics`."""
 
     block_ns: int
@@ -194,7 +194,7 @@ class MarkerSensor:
             *middle,
         )
         # floats also where a setting was written as whole
-        self._camera = Camera(
+        self._camera = CameraKernel(
             optics.block_ns,
             optics.path == "chord",
             float(optics.contrast),
@@ -233,10 +233,10 @@ class MarkerSensor:
         return new_circuit(self.threshold, off, leak_hz, optics.cutoff_hz)
 
     @property
-    def scans(self) -> Scans:
+    def scans(self) -> ScanTimes:
         """Scan times of the read-out in this trial."""
         optics = self.optics
-        return Scans(optics.period_ns, self._phase_ns, optics.column_ns, optics.width)
+        return ScanTimes(optics.period_ns, self._phase_ns, optics.column_ns, optics.width)
 
     def path(self, loads: F64) -> F64:
         """Markers in the image: column, row and radius in px, (n, 3, m).
@@ -322,7 +322,7 @@ class MarkerSensor:
         )
         return when, x, y, p
 
-    def _flickering(self, share: float, hz: float, since_ns: int) -> Flicker:
+    def _flickering(self, share: float, hz: float, since_ns: int) -> FlickeringLight:
         """Return a light that flickers from a true time on."""
         on = off = self.threshold
         if self.optics.has_circuit:
@@ -385,13 +385,13 @@ def trace(
     layout_mm: F64,
     projection: tuple[float, float, float, float, float, float],
     row_ns: I64,
-    camera: Camera,
+    camera: CameraKernel,
     phase_ns: int,
     of_pixels: Pixels,
     lists: RimLists,
     circuit: Circuit,
     noise: Candidates,
-    light: Flicker,
+    light: FlickeringLight,
     pending: I64,
 ) -> tuple[I64, U16, U16, U8, I64]:
     """Return signal and noise events under `loads`, as the camera delivers them.
@@ -403,7 +403,7 @@ def trace(
     Args:
         loads, layout_mm, projection: see `marker_path.markers_in_image`.
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
-        camera: `Camera`; phase_ns: of `readout.Scans`.
+        camera: `CameraKernel`; phase_ns: of `readout.Scans`.
         of_pixels, lists: `Pixels` and `RimLists`, written.
         circuit: pixels of `circuit`, which do all signal events where there are any.
         noise: `noise.Candidates`, at least those of this time.

@@ -28,7 +28,7 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 
-class Flicker(NamedTuple):
+class FlickeringLight(NamedTuple):
     """A light, and the n pixels that fire by it."""
 
     share: float
@@ -48,13 +48,15 @@ class Flicker(NamedTuple):
     """Reference level of log intensity over that of the mean, (n,); written."""
 
 
-def steady() -> Flicker:
+def steady() -> FlickeringLight:
     """Return a light that does not flicker."""
     none = np.empty(0)
-    return Flicker(0.0, 1.0, 0.0, 0, np.empty(0, np.int64), none, none, none.copy())
+    return FlickeringLight(0.0, 1.0, 0.0, 0, np.empty(0, np.int64), none, none, none.copy())
 
 
-def new_flicker(share: float, hz: float, on: F64, off: F64, since_ns: int, seed: int) -> Flicker:
+def new_flicker(
+    share: float, hz: float, on: F64, off: F64, since_ns: int, seed: int
+) -> FlickeringLight:
     """Return the light of a trial, and all pixels that can fire by it for long.
 
     Args:
@@ -71,7 +73,7 @@ def new_flicker(share: float, hz: float, on: F64, off: F64, since_ns: int, seed:
     on, off, lots = on[y, x], off[y, x], lots[y, x]
     level = _level_at(float(since_ns), share, hz, origin_ns) - on + lots * (on + off)
     place = x.astype(np.int64) << 12 | y
-    return Flicker(float(share), float(hz), origin_ns, since_ns, place, on, off, level)
+    return FlickeringLight(float(share), float(hz), origin_ns, since_ns, place, on, off, level)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -82,7 +84,7 @@ def _level_at(t_ns: float, share: float, hz: float, origin_ns: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def flicker_events(
-    light: Flicker, begin_ns: int, end_ns: int, base_ns: int, events: I64, n: int
+    light: FlickeringLight, begin_ns: int, end_ns: int, base_ns: int, events: I64, n: int
 ) -> tuple[I64, int]:
     """Append the events of a block of true time, and move the reference levels.
 

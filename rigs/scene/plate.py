@@ -19,7 +19,7 @@ from sliplab.rigs.scene.contact import (
     LANES,
     Block,
     Blocks,
-    Step,
+    ContactStep,
     feel_spots,
     make_blocks,
     move_tips,
@@ -45,7 +45,7 @@ def _pull(
     law: Law,
     sensor: F64,
     plate_y: float,
-    step: Step,
+    step: ContactStep,
     new: float,
 ) -> float:
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
@@ -74,7 +74,7 @@ def _solve(
     law: Law,
     sensor: F64,
     motion: F64,
-    step: Step,
+    step: ContactStep,
     mass: float,
     weight: float,
     stiction: float,
@@ -92,7 +92,7 @@ def _solve(
     inertia = mass * 1e-3 / h  # N per mm/s
     plate_y, speed = motion[0] + (1.0 - new) * motion[1] * h, motion[1]
     weight -= (1.0 - new) * pulls
-    at_rest = Step(h, decay, gain, (1.0 - new) * speed)
+    at_rest = ContactStep(h, decay, gain, (1.0 - new) * speed)
     rest = _pull(blocks, n, field, law, sensor, plate_y, at_rest, new)
     push = new * rest - weight + inertia * speed
     if abs(push) <= stiction:
@@ -105,7 +105,7 @@ def _solve(
     v = speed if min(zero, far) < speed < max(zero, far) else far
     for _ in range(_ITERATIONS):
         f = inertia * (v - speed) + weight + drag
-        moving = Step(h, decay, gain, (1.0 - new) * (speed - v))
+        moving = ContactStep(h, decay, gain, (1.0 - new) * (speed - v))
         f -= new * _pull(blocks, n, field, law, sensor, plate_y + new * v * h, moving, new)
         if f == 0.0:
             return v
@@ -189,7 +189,7 @@ def advance_free(
             pulls = 0.0
             for i in range(n):
                 pulls += blocks[i // LANES].force_y[i % LANES]
-            before, step = motion[1], Step(h, decay, gain, 0.0)
+            before, step = motion[1], ContactStep(h, decay, gain, 0.0)
             speed = _solve(
                 blocks,
                 n,
@@ -228,7 +228,7 @@ def advance_free(
                 law,
                 sensor[k],
                 motion[0] + 0.5 * (before + held) * h,
-                Step(h, decay, gain, 0.5 * (before - held)),
+                ContactStep(h, decay, gain, 0.5 * (before - held)),
                 new,
             )
             share = _lets_go_first(blocks, n)
@@ -252,7 +252,7 @@ def advance_free(
                 at,
                 height,
                 begin_ns * 1e-9,
-                Step(part, decay, gain, 0.5 * share * (before - held)),
+                ContactStep(part, decay, gain, 0.5 * share * (before - held)),
             )
             motion[0], motion[1] = height, before + share * (held - before)
             begin_weight += share * (weight[k + 1] - begin_weight)
@@ -271,7 +271,7 @@ def advance_free(
             height, swerve, motion[1] = stop, (mean - speed) * share, 0.0
         else:
             at, swerve, motion[1] = sensor[k], mean - speed, speed
-        step = Step(h, decay, gain, swerve)
+        step = ContactStep(h, decay, gain, swerve)
         move_tips(blocks, n, field, law, at, height, begin_ns * 1e-9, step)
         motion[0] = height
         record(blocks, n, height, track[k], load[k])

@@ -34,7 +34,7 @@ _TIME_BITS = 27
 
 
 @dataclass(frozen=True)
-class Scans:
+class ScanTimes:
     """Times at which a read-out scans its array and reads each column, true ns."""
 
     period_ns: int
@@ -140,7 +140,7 @@ def read_scans(
     """Deliver the scans that are read to their last column by `end_ns`; see `read_each`.
 
     Args:
-        period_ns, phase_ns, column_ns: see `Scans`.
+        period_ns, phase_ns, column_ns: see `ScanTimes`.
 
     Returns:
         how many events are delivered in all, and how many of later scans are left: these are

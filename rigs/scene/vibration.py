@@ -18,7 +18,7 @@ I64 = npt.NDArray[np.int64]
 TONES = 2
 
 
-class Vibration:
+class ArmVibration:
     """Two sines an axis, whose frequencies belong to the rig's seed and phases to the trial's."""
 
     def __init__(self, peak_um: float, frequency_hz: float, rig_seed: int, trial_seed: int) -> None:

@@ -17,10 +17,10 @@ from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
 from sliplab.storage.formats.adapted_streams import (
     NO_ROW,
-    EventSource,
+    AdaptedEvents,
     FrameNotes,
-    Samples,
     SampleT,
+    TableSamples,
     read_events,
     read_frames,
     read_poses,
@@ -36,17 +36,17 @@ from sliplab.storage.formats.adapted_trials import (
     AdaptedTrial,
 )
 from sliplab.storage.formats.foreign import (
+    DataSpan,
     ForeignTrial,
     FormatError,
     LabelError,
-    Seen,
     Whole,
     broken,
     refusal,
 )
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
-from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, Step
+from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, MotionStep
 from sliplab.storage.streams import Json, StreamChunk
 from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, Store
 
@@ -272,21 +272,21 @@ class _Opening:
         with self._named(stream):
             yield from chunks
 
-    def _samples(self, name: str, what: str, found: Samples[SampleT]) -> SampleT:
+    def _samples(self, name: str, what: str, found: TableSamples[SampleT]) -> SampleT:
         """Note the rows that were left out, and the resolution of the times of a table."""
         self.resolution_us[name] = found.resolution_us
         if found.wrong:
             self.left_out[NO_ROW.format(what)] += found.wrong
         return found.chunk
 
-    def _open_events(self) -> EventSource:
+    def _open_events(self) -> AdaptedEvents:
         part = self.found.adapter.streams.events
         assert part is not None
         here = part.format in {"counts", "csv", "numpy"}
         paths = [] if here else self._paths(EVENTS)
         return read_events(self.found.folder, self._names(EVENTS), part, paths, self.salvage)
 
-    def _with_events(self, made: ForeignTrial, source: EventSource) -> ForeignTrial:
+    def _with_events(self, made: ForeignTrial, source: AdaptedEvents) -> ForeignTrial:
         if source.span_us is not None:
             self.span_ns = source.span_us[0] * 1000, source.span_us[1] * 1000
         self.clocks["events"] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
@@ -370,7 +370,7 @@ class _Opening:
             self.unknown.append("motion")
         return found
 
-    def _whole(self, seen: Seen, motion: tuple[int, int] | None) -> Whole:
+    def _whole(self, seen: DataSpan, motion: tuple[int, int] | None) -> Whole:
         """Return span, labels and steps.
 
         Raises:
@@ -383,7 +383,7 @@ class _Opening:
         except InputError as error:
             raise LabelError(error.file, error.key, error.value, error.expected) from None
 
-    def _span(self, seen: Seen) -> tuple[int, int]:
+    def _span(self, seen: DataSpan) -> tuple[int, int]:
         """Return begin and end of events and frames on the time line."""
         ends = []
         if seen.events_us is not None:
@@ -452,7 +452,7 @@ class _Opening:
             uncertainty_ns=error,
         )
 
-    def _steps(self, span: tuple[int, int], found: tuple[int, int]) -> tuple[Step, ...]:
+    def _steps(self, span: tuple[int, int], found: tuple[int, int]) -> tuple[MotionStep, ...]:
         motion = self.found.adapter.motion
         assert motion is not None
         start, end = (self._line_ns(ns, motion.clock, span) for ns in found)
@@ -468,6 +468,6 @@ class _Opening:
         arm = self.clocks.get("arm")
         line = IDENTITY if arm is None else arm.map
         times = [int(line.to_device(ns)) for ns in (span[0], start, end)]
-        hold = Step(phase="hold", start_ns=times[0], end_ns=times[1])
-        slide = Step(phase="slide", start_ns=times[1], end_ns=times[2])
+        hold = MotionStep(phase="hold", start_ns=times[0], end_ns=times[1])
+        slide = MotionStep(phase="slide", start_ns=times[1], end_ns=times[2])
         return (hold, slide) if times[1] > times[0] else (slide,)

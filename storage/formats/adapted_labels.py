@@ -13,7 +13,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
 from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import DataFolder
-from sliplab.storage.formats.tables import Row, exact_ns, read_rows
+from sliplab.storage.formats.tables import TableRow, exact_ns, read_rows
 
 SLIP = ("no_slip", "incipient", "gross")
 _SOME = 5
@@ -26,7 +26,7 @@ class FoundTime:
     """A time that a label states, on the clock that it names, ns; `row` and `column` say where."""
 
     ns: int
-    row: Row
+    row: TableRow
     column: str
 
 
@@ -178,19 +178,19 @@ def _rows(
     file_of_all: FileOfAll,
     lookup: Lookup,
     warnings: list[str],
-) -> dict[str, list[Row]]:
+) -> dict[str, list[TableRow]]:
     """Return the rows that belong to each trial."""
     if part.file is None:
         if isinstance(part, GivenSpans):
             raise InputError(file, f"{key}.file", None, "is missing")
-        return {id_: [Row(f"trial {id_}", 1, fields)] for id_, fields in trials.items()}
+        return {id_: [TableRow(f"trial {id_}", 1, fields)] for id_, fields in trials.items()}
     pattern = parse_pattern(part.file)
     if not pattern.fields:
         name = file_of_all(part.file, f"{key}.file")
         rows = read_rows(folder, name)
         _check_columns(part, key, file, rows)
         return _matched(part, key, file, rows, trials, warnings)
-    found: dict[str, list[Row]] = {}
+    found: dict[str, list[TableRow]] = {}
     names = lookup(pattern, f"{key}.file", list(trials.values()))
     for (id_, fields), of_trial in zip(trials.items(), names, strict=True):
         if len(of_trial) > 1:
@@ -209,7 +209,9 @@ def _rows(
     return found
 
 
-def _check_columns(part: GivenOnsets | GivenSpans, key: str, file: Path, rows: list[Row]) -> None:
+def _check_columns(
+    part: GivenOnsets | GivenSpans, key: str, file: Path, rows: list[TableRow]
+) -> None:
     """Check that every column that the adapter names is in some row."""
     there = {column for row in rows for column in row.values}
     named = {f"{key}.match": list(part.match)}
@@ -237,11 +239,11 @@ def _matched(
     part: GivenOnsets | GivenSpans,
     key: str,
     file: Path,
-    rows: list[Row],
+    rows: list[TableRow],
     trials: Mapping[str, dict[str, str]],
     warnings: list[str],
-) -> dict[str, list[Row]]:
-    by_value: dict[tuple[str, ...], list[Row]] = {}
+) -> dict[str, list[TableRow]]:
+    by_value: dict[tuple[str, ...], list[TableRow]] = {}
     for row in rows:
         value = tuple(row.values.get(column, "") for column in part.match)
         by_value.setdefault(value, []).append(row)
@@ -272,7 +274,7 @@ def _matched(
     return found
 
 
-def _time(row: Row, column: str, unit: str) -> FoundTime | None:
+def _time(row: TableRow, column: str, unit: str) -> FoundTime | None:
     found = row.time_ns(column, unit)
     return None if found is None else FoundTime(found, row, column)
 
@@ -281,7 +283,7 @@ def _uncertainty_ns(part: GivenOnsets | GivenSpans) -> float | None:
     return None if part.uncertainty_ms is None else part.uncertainty_ms * 1e6
 
 
-def _onsets(part: GivenOnsets, rows: list[Row]) -> FoundLabel | None:
+def _onsets(part: GivenOnsets, rows: list[TableRow]) -> FoundLabel | None:
     if not rows:
         return None
     if len(rows) > 1:
@@ -309,7 +311,7 @@ def _onsets(part: GivenOnsets, rows: list[Row]) -> FoundLabel | None:
     )
 
 
-def _spans(part: GivenSpans, rows: list[Row], adapter: Adapter) -> FoundLabel | None:
+def _spans(part: GivenSpans, rows: list[TableRow], adapter: Adapter) -> FoundLabel | None:
     spans = []
     for row in rows:
         start, end = _time(row, part.start, part.unit), _time(row, part.end, part.unit)

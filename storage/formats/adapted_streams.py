@@ -61,7 +61,7 @@ MOST_EVENTS = 1 << 32
 
 
 @dataclass(frozen=True)
-class EventSource:
+class AdaptedEvents:
     """Events that can be read.
 
     Attributes:
@@ -77,7 +77,7 @@ class EventSource:
     foreign: ForeignTrial | None = None
 
 
-def read_counts(array: Any, part: EventFiles) -> EventSource:
+def read_counts(array: Any, part: EventFiles) -> AdaptedEvents:
     """Turn counts per time step into events.
 
     A count c in step k becomes c events at ``k step + i step / c`` for i from 0 to c - 1, cut to
@@ -128,7 +128,7 @@ def read_counts(array: Any, part: EventFiles) -> EventSource:
             chunk = _spread(counts, first, step_us, polarity)
             yield replace(chunk, left_out={NO_COUNT: wrong}) if wrong else chunk
 
-    return EventSource(chunks, lambda: (columns, rows), (0, steps * step_us))
+    return AdaptedEvents(chunks, lambda: (columns, rows), (0, steps * step_us))
 
 
 def _whole(counts: Any, part: EventFiles) -> tuple[I64, int]:
@@ -170,7 +170,7 @@ def read_events(
     part: EventFiles,
     paths: Sequence[Path],
     salvage: bool = False,
-) -> EventSource:
+) -> AdaptedEvents:
     """Open the events of a trial.
 
     Args:
@@ -197,10 +197,10 @@ def read_events(
         if len(paths) != 1:
             raise FormatError(f"are {len(paths)} files for one trial")
         foreign = read_file(part.format, paths[0], "trial", salvage)
-    return EventSource(foreign.events, foreign.event_px, None, foreign)
+    return AdaptedEvents(foreign.events, foreign.event_px, None, foreign)
 
 
-def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource:
+def _event_table(folder: DataFolder, name: str, part: EventFiles) -> AdaptedEvents:
     assert part.columns is not None
     assert part.unit is not None
     columns = {
@@ -233,7 +233,7 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> EventSource
                 chunk = replace(chunk, left_out={**chunk.left_out, NO_ROW.format("events"): wrong})
             yield chunk
 
-    return EventSource(chunks, lambda: size)
+    return AdaptedEvents(chunks, lambda: size)
 
 
 def _check_polarities(values: Any) -> None:
@@ -382,7 +382,7 @@ def _images(
 
 
 @dataclass(frozen=True)
-class Samples(Generic[SampleT]):
+class TableSamples(Generic[SampleT]):
     """Rows of a table.
 
     Attributes:
@@ -395,28 +395,30 @@ class Samples(Generic[SampleT]):
     wrong: int
 
 
-def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> Samples[PoseChunk]:
+def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> TableSamples[PoseChunk]:
     """Read the poses of a trial. Raises FormatError: the table cannot be right."""
     t_ns, found, about = _samples(folder, name, part)
     metres, radians = part.length == "m", part.angle == "rad"
     xyz = _vectors(found, ("x", "y", "z"), len(t_ns)) * (1000.0 if metres else 1.0)
     turned = _vectors(found, ("rx", "ry", "rz"), len(t_ns))
-    return Samples(PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned), *about)
+    return TableSamples(
+        PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned), *about
+    )
 
 
-def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> Samples[WrenchChunk]:
+def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> TableSamples[WrenchChunk]:
     """Read forces and torques. Raises FormatError: the table cannot be right."""
     t_ns, found, about = _samples(folder, name, part)
     force = _vectors(found, ("fx", "fy", "fz"), len(t_ns))
     torque = _vectors(found, ("tx", "ty", "tz"), len(t_ns))
-    return Samples(WrenchChunk(t_ns, t_ns, force, torque), *about)
+    return TableSamples(WrenchChunk(t_ns, t_ns, force, torque), *about)
 
 
-def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> Samples[ScalarChunk]:
+def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> TableSamples[ScalarChunk]:
     """Read one quantity. Raises FormatError: the table cannot be right."""
     t_ns, found, about = _samples(folder, name, part)
     values = found["value"].astype(np.float64)
-    return Samples(ScalarChunk(t_ns, t_ns, values, part.quantity_unit), *about)
+    return TableSamples(ScalarChunk(t_ns, t_ns, values, part.quantity_unit), *about)
 
 
 def _samples(

@@ -21,7 +21,7 @@ from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
 from sliplab.storage.formats.recognition import unique_names
-from sliplab.storage.formats.tables import Row, read_rows
+from sliplab.storage.formats.tables import TableRow, read_rows
 
 EVENTS, FRAMES, FRAME_TIMES, POSES = "events", "frames", "frames.times", "poses"
 """Streams by the keys of their files; wrenches and scalars are ``wrenches.NAME``."""
@@ -94,7 +94,7 @@ class _Draft:
     """Its own file; None of a row without one."""
     fields: dict[str, str]
     built_in: dict[str, str] = field(default_factory=dict)
-    row: Row | None = None
+    row: TableRow | None = None
 
     @property
     def all(self) -> dict[str, str]:

@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from sliplab.storage.formats.flatbuffers import (
     GREY,
-    Table,
+    FlatTable,
     events_buffer,
     frame_buffer,
     header_buffer,
@@ -63,7 +63,7 @@ _COLOUR = {16: 3, 24: 4}
 
 
 @dataclass(frozen=True)
-class Stream:
+class Aedat4Stream:
     """One stream of a file: its kind, and the size of its images."""
 
     kind: str
@@ -108,7 +108,7 @@ class Aedat4File:
                     f"is not an AEDAT4 file: it starts with {line!r}, not with {LINE!r}"
                 )
             header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
-            table = Table.root(memoryview(_prefixed(header)), b"IOHE")
+            table = FlatTable.root(memoryview(_prefixed(header)), b"IOHE")
             self._codec = _CODECS.get(table.number(0, "<i"), "")
             if self._codec == "":
                 raise FormatError("has an unknown compression")
@@ -193,7 +193,7 @@ class Aedat4File:
             data = self._unpacked(self._exactly(min(self._bytes - self._table, _MOST_PACKET)))
             count = sum(
                 row.number(2, "<q")
-                for row in Table.root(data, b"FTAB").tables(0)
+                for row in FlatTable.root(data, b"FTAB").tables(0)
                 # a place in the table is behind the 8 bytes of its packet's header
                 if row.number(1, "<i") == number and row.number(0, "<q") >= self._end + 8
             )
@@ -240,13 +240,13 @@ class Aedat4File:
     def _trigger_packets(self, number: int) -> Iterator[list[tuple[int, int]]]:
         """Yield time, us, and kind of all triggers in a packet."""
         for data in self._packets(number):
-            tables = Table.root(data, b"TRIG").tables(0)
+            tables = FlatTable.root(data, b"TRIG").tables(0)
             yield [(table.number(0, "<q"), table.number(1, "<B")) for table in tables]
 
     def pictures(self, number: int) -> Iterator[Picture]:
         """Yield the frames of a stream, colours as grey levels."""
         for data in self._packets(number):
-            table = Table.root(data, b"FRME")
+            table = FlatTable.root(data, b"FRME")
             t_ns, form = _middle_ns(table), table.number(5, "<b")
             width, height = table.number(6, "<h"), table.number(7, "<h")
             channels = 1 if form == GREY else _COLOUR.get(form, 0)
@@ -313,7 +313,7 @@ class Aedat4File:
         return found
 
 
-def _middle_ns(frame: Table) -> int:
+def _middle_ns(frame: FlatTable) -> int:
     """Return the middle of a frame's exposure, or its time stamp without start and end, ns.
 
     The time stamp is the start of exposure in what dv-processing writes, and the middle in what
@@ -333,7 +333,7 @@ def _middle_ns(frame: Table) -> int:
 
 def _event_words(data: memoryview) -> Any:
     """Return two 64-bit words an event of a packet."""
-    words = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
+    words = np.frombuffer(FlatTable.root(data, b"EVTS").vector(0, 16)[1], "<u8")
     if not words.flags.aligned:
         words = words.copy()
     words.flags.writeable = False  # `_split_events` is compiled for such
@@ -400,7 +400,7 @@ def _zstd_size(frame: bytes) -> int:
     return int.from_bytes(frame[at : at + width], "little") + (256 if width == 2 else 0)
 
 
-def _streams(text: bytes) -> dict[int, Stream]:
+def _streams(text: bytes) -> dict[int, Aedat4Stream]:
     if b"<!" in text:
         raise FormatError("has a header with entity definitions")
     try:
@@ -413,7 +413,9 @@ def _streams(text: bytes) -> dict[int, Stream]:
                 size = (int(values["sizeX"]), int(values["sizeY"]))
             kind = values.get("typeIdentifier", "")
             name = values.get("originalOutputName", kind)
-            found[int(node.get("name", ""))] = Stream(kind, name, size, values.get("source", ""))
+            found[int(node.get("name", ""))] = Aedat4Stream(
+                kind, name, size, values.get("source", "")
+            )
     except (ElementTree.ParseError, ValueError) as error:
         raise FormatError(f"has a header that cannot be read: {error}") from None
     return found
@@ -426,7 +428,7 @@ class Aedat4Writer:
         streams: all streams that will be written, by number.
     """
 
-    def __init__(self, path: Path, streams: dict[int, Stream]) -> None:
+    def __init__(self, path: Path, streams: dict[int, Aedat4Stream]) -> None:
         self._handle = path.open("wb")
         self._handle.write(LINE + header_buffer(_described(streams), _ZSTD))
 
@@ -455,7 +457,7 @@ class Aedat4Writer:
         self._handle.write(struct.pack("<ii", number, len(packed)) + packed)
 
 
-def _described(streams: dict[int, Stream]) -> str:
+def _described(streams: dict[int, Aedat4Stream]) -> str:
     root = ElementTree.Element("dv", version="2.0")
     out = ElementTree.SubElement(root, "node", name="outInfo", path="/outInfo/")
     for number, stream in sorted(streams.items()):

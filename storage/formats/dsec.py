@@ -33,7 +33,7 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.formats.time_order import is_unordered
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, EventChunk
-from sliplab.storage.trials.hdf5_reader import FileContent, RowFile, Rows
+from sliplab.storage.trials.hdf5_reader import FileContent, Hdf5Column, RowFile
 from sliplab.storage.trials.superblock import SIGNATURE
 
 PIECE = 1 << 20
@@ -111,7 +111,7 @@ def _offset(file: RowFile) -> int:
     return offset
 
 
-def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
+def _triggers(file: RowFile, rows: Callable[[str], Hdf5Column]) -> Triggers | None:
     if not file.has("triggers/t"):
         return None
     kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
@@ -121,7 +121,7 @@ def _triggers(file: RowFile, rows: Callable[[str], Rows]) -> Triggers | None:
     return found
 
 
-def _dsec_events(columns: Mapping[str, Rows], offset: int, low: int, high: int) -> EventChunk:
+def _dsec_events(columns: Mapping[str, Hdf5Column], offset: int, low: int, high: int) -> EventChunk:
     x, y, p, t = (columns[key].read(low, high) for key in "xypt")
     return event_chunk(x, y, _polarities(p), _integers(t) + offset)
 
@@ -192,7 +192,7 @@ def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
 
 
 def _lab_events(
-    columns: Mapping[str, Rows], low: int, high: int
+    columns: Mapping[str, Hdf5Column], low: int, high: int
 ) -> tuple[I64, I64, Any, I64, float]:
     """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
     xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
@@ -232,7 +232,7 @@ def _lab_trial(
     )
 
 
-def _piece(columns: Mapping[str, Rows]) -> int:
+def _piece(columns: Mapping[str, Hdf5Column]) -> int:
     """Return the rows that are read or lost together: a chunk of the column of times."""
     *_, times = columns.values()
     starts = (low for low, *_ in times.stored())
@@ -244,7 +244,7 @@ def _piece(columns: Mapping[str, Rows]) -> int:
 
 def _whole_rows(
     path: Path,
-    columns: Mapping[str, Rows],
+    columns: Mapping[str, Hdf5Column],
     check: Callable[[int, int], object],
 ) -> tuple[int, Lost | None]:
     """Return the number of rows before the first that cannot be read in all columns.
@@ -279,7 +279,7 @@ def _whole_rows(
     return count, Lost(at_byte=at, unread_bytes=unread, reason=reason, events=said - count)
 
 
-def _rows_inside(column: Rows, count: int, size: int) -> int:
+def _rows_inside(column: Hdf5Column, count: int, size: int) -> int:
     """Return how many of the first `count` rows are in a file of `size` bytes."""
     known = 0
     with suppress(*_FAULTS):  # the file's list of pieces may be damaged itself
@@ -292,7 +292,7 @@ def _rows_inside(column: Rows, count: int, size: int) -> int:
     return min(known, count)
 
 
-def _unread(column: Rows, count: int, size: int) -> Iterator[tuple[int, int]]:
+def _unread(column: Hdf5Column, count: int, size: int) -> Iterator[tuple[int, int]]:
     """Yield place and bytes of the pieces with rows from `count` on that the file has."""
     pieces: list[tuple[int, int, int | None]] = []
     with suppress(*_FAULTS):
@@ -304,7 +304,7 @@ def _unread(column: Rows, count: int, size: int) -> Iterator[tuple[int, int]]:
 
 
 def _resolution(
-    stated: list[int] | None, of: Mapping[str, Rows], count: int
+    stated: list[int] | None, of: Mapping[str, Hdf5Column], count: int
 ) -> tuple[int, int] | None:
     """Return columns and rows of the camera, by the attribute `sensor_resolution`.
 
@@ -389,7 +389,7 @@ class _opened:
         self._path, self._torn = path, torn
         self._padded: FileContent | None = None
 
-    def __enter__(self) -> tuple[RowFile, Callable[[str], Rows]]:
+    def __enter__(self) -> tuple[RowFile, Callable[[str], Hdf5Column]]:
         size = self._path.stat().st_size
         try:
             end = _stated_end(self._path)
@@ -425,7 +425,7 @@ class _opened:
         if self._padded is not None:
             self._padded.close()
 
-    def _rows(self, name: str) -> Rows:
+    def _rows(self, name: str) -> Hdf5Column:
         if not self._file.has(name):
             raise FormatError(f"has no column {name}; {_LAYOUTS}")
         found = self._file.rows(name)

@@ -39,7 +39,7 @@ _FRAME_VTABLE = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 44, 46, 48, 50, 5
 """Five times, kind, width, height, place, and where the pixels are."""
 
 
-class Table:
+class FlatTable:
     """A table at a place in some bytes."""
 
     def __init__(self, data: memoryview, at: int) -> None:
@@ -48,7 +48,7 @@ class Table:
         self._count = (_number(data, "<H", self._fields) - 4) // 2
 
     @classmethod
-    def root(cls, data: memoryview, identifier: bytes) -> Table:
+    def root(cls, data: memoryview, identifier: bytes) -> FlatTable:
         """Return the table of a buffer with its length in front and an identifier.
 
         Raises:
@@ -74,7 +74,7 @@ class Table:
             raise FormatError(f"is damaged: {count} items in too few bytes")
         return count, self._data[at + 4 : at + 4 + count * size]
 
-    def tables(self, field: int) -> list[Table]:
+    def tables(self, field: int) -> list[FlatTable]:
         """Return a vector of tables."""
         at = self._place(field)
         if at is None:
@@ -82,7 +82,7 @@ class Table:
         first = at + _number(self._data, "<I", at) + 4
         count, _ = self.vector(field, 4)
         places = range(first, first + 4 * count, 4)
-        return [Table(self._data, place + _number(self._data, "<I", place)) for place in places]
+        return [FlatTable(self._data, place + _number(self._data, "<I", place)) for place in places]
 
     def _place(self, field: int) -> int | None:
         if field >= self._count:

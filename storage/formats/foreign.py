@@ -14,7 +14,7 @@ import numpy as np
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.time_order import in_order
-from sliplab.storage.schema.trial import Counts, DeviceRecord, Given, Lost, Step
+from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, MotionStep, StreamCounts
 from sliplab.storage.streams import (
     I64,
     U8,
@@ -141,7 +141,7 @@ class ForeignCampaign(Protocol):
 class Restorable(Protocol):
     """A trial of a store that can be committed to another store as it was."""
 
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
         """Commit the trial with its label and clocks.
 
         Args:
@@ -156,7 +156,7 @@ class Restorable(Protocol):
 
 
 @dataclass(frozen=True)
-class Seen:
+class DataSpan:
     """First and last time of a trial's data, each on its own clock; None without any.
 
     Attributes:
@@ -179,7 +179,7 @@ class Whole:
 
     span_ns: tuple[int, int]
     given: Given | None = None
-    steps: tuple[Step, ...] = ()
+    steps: tuple[MotionStep, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ class ForeignTrial:
     clocks: Mapping[str, DeviceRecord] = field(default_factory=dict)
     experiment: str = "imported"
     geometry: Json = field(default_factory=dict)
-    whole: Callable[[Seen], Whole] | None = None
+    whole: Callable[[DataSpan], Whole] | None = None
     error: FormatError | InputError | None = None
 
 

@@ -32,13 +32,13 @@ from sliplab.storage.formats.foreign import (
     OUTSIDE,
     RISING,
     Damage,
+    DataSpan,
     ForeignCampaign,
     ForeignChunk,
     ForeignTrial,
     FormatError,
     LabelError,
     NoEvents,
-    Seen,
     Whole,
     as_damage,
     before_damage,
@@ -52,15 +52,15 @@ from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
-    Clocks,
-    Counts,
     DeviceRecord,
     Gate,
     Geometry,
     Lost,
     Provenance,
-    Quality,
+    StreamCounts,
     StreamRecord,
+    TrialClockMaps,
+    TrialQuality,
     TrialRecord,
 )
 from sliplab.storage.streams import (
@@ -440,7 +440,7 @@ def _write(campaign: Campaign, trial: ForeignTrial, kind: str, content: _Content
         if not sum(content.rows.values()) and trial.whole is None:
             raise NoEvents("contains no events; nothing to import")
         counts = writer.counts
-        rows = Counts(
+        rows = StreamCounts(
             events=counts["events/t"],
             frames=counts["frames/t"],
             poses=counts.get("poses/t", 0),
@@ -471,7 +471,7 @@ def _events(trial: ForeignTrial, content: _Content) -> Iterator[EventChunk]:
 
 
 @interruptible
-def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
+def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> DataSpan:
     """Write events, triggers and frames; return first and last times.
 
     Raises:
@@ -515,7 +515,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> Seen:
         ends = events[0] * 1000, events[1] * 1000
         content.check_times(EVENTS_KIND, ends, resolution, distinct)
     content.warnings += _gap_warnings(gap_us, gap_end_us)
-    return Seen(events, times)
+    return DataSpan(events, times)
 
 
 def _fill_triggers(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> None:
@@ -669,7 +669,7 @@ def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
     ]
 
 
-def _seconds(seen: Seen, whole: Whole | None) -> float:
+def _seconds(seen: DataSpan, whole: Whole | None) -> float:
     """Return the length of a recording: as it is stated, or from its first to its last event."""
     if whole is not None:
         return (whole.span_ns[1] - whole.span_ns[0]) / 1e9
@@ -680,8 +680,8 @@ def _seconds(seen: Seen, whole: Whole | None) -> float:
 
 
 def _clocks(
-    trial: ForeignTrial, counts: Counts, whole: Whole | None, streams: dict[str, StreamRecord]
-) -> Clocks:
+    trial: ForeignTrial, counts: StreamCounts, whole: Whole | None, streams: dict[str, StreamRecord]
+) -> TrialClockMaps:
     there = {
         "events": counts.events > 0 or trial.event_px() is not None,
         "frames": trial.frames is not None,
@@ -695,15 +695,15 @@ def _clocks(
     }
     if streams:
         found["streams"] = {name: trial.clocks.get(name, _UNKNOWN) for name in streams}
-    return Clocks(**found)
+    return TrialClockMaps(**found)
 
 
 def _record(
     campaign: Campaign,
     trial: ForeignTrial,
     kind: str,
-    counts: Counts,
-    seen: Seen,
+    counts: StreamCounts,
+    seen: DataSpan,
     content: _Content,
     streams: dict[str, StreamRecord],
 ) -> TrialRecord:
@@ -740,7 +740,7 @@ def _record(
         "recorded_s": _seconds(seen, whole),
         "counts": counts,
         "clocks": _clocks(trial, counts, whole, streams),
-        "quality": Quality(passed=not content.gates, gates=content.gates),
+        "quality": TrialQuality(passed=not content.gates, gates=content.gates),
         "steps": () if whole is None else whole.steps,
         "geometry": Geometry.model_validate(
             {"event_px": event_px, "frame_px": trial.frame_px, **trial.geometry}

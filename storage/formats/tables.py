@@ -35,7 +35,7 @@ _TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A row of a small table.
 
     Attributes:
@@ -80,7 +80,7 @@ def exact_ns(text: str, unit: str) -> int | None:
     return found if abs(found) < LATEST_US * 1000 else None
 
 
-def read_rows(folder: DataFolder, name: str) -> list[Row]:
+def read_rows(folder: DataFolder, name: str) -> list[TableRow]:
     """Read a small table; the ending says which: ``.json``, ``.jsonl``, ``.ndjson``, else CSV.
 
     Raises:
@@ -115,7 +115,7 @@ def _json(place: str, text: str, line: int | None) -> Any:
         raise InputError(place, where, None, f"is not JSON: {error}") from None
 
 
-def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[Row]:
+def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[TableRow]:
     if not isinstance(found, list):
         raise InputError(place, "", None, "must be a list of objects, one a row")
     rows = []
@@ -128,7 +128,7 @@ def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[Row]:
                 raise InputError(place, f"row {number}, {column}", None, "must be text or a number")
             if value is not None and value != "":
                 values[column] = str(value).lower() if isinstance(value, bool) else value.strip()
-        rows.append(Row(place, number, values))
+        rows.append(TableRow(place, number, values))
     return rows
 
 
@@ -138,11 +138,11 @@ def _separator(line: str) -> str:
     return next((each for each in _SEPARATORS[:3] if each in line), " " if " " in line else ",")
 
 
-def _from_csv(place: str, text: str) -> list[Row]:
+def _from_csv(place: str, text: str) -> list[TableRow]:
     reader = csv.reader(
         io.StringIO(text), delimiter=_separator(text.partition("\n")[0]), strict=True
     )
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     columns: list[str] | None = None
     try:
         for cells in reader:
@@ -165,7 +165,7 @@ def _from_csv(place: str, text: str) -> list[Row]:
                 for column, cell in zip(columns, cells, strict=True)
                 if cell.strip()
             }
-            rows.append(Row(place, reader.line_num, values))
+            rows.append(TableRow(place, reader.line_num, values))
     except csv.Error as error:
         raise InputError(place, f"row {reader.line_num}", None, f"is not CSV: {error}") from None
     if columns is None:

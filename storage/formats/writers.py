@@ -7,7 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import (
+    EVENTS,
+    FRAMES,
+    SIMULATED,
+    TRIGGERS,
+    Aedat4Stream,
+    Aedat4Writer,
+)
 from sliplab.storage.formats.dsec import write_dsec
 from sliplab.storage.formats.foreign import RISING, Triggers
 from sliplab.storage.streams import EVENTS_KIND, I64, EventChunk
@@ -25,7 +32,7 @@ def export_aedat4(recording: Recording, path: Path, stream: str) -> dict[str, in
     if not (_has_events(recording, stream) or recording.has_video):
         raise ValueError("has neither events nor a video, and AEDAT4 holds those alone")
     triggers = _triggers(recording, stream)
-    streams = {0: Stream(EVENTS, "events", _size(recording, stream), _source(recording))}
+    streams = {0: Aedat4Stream(EVENTS, "events", _size(recording, stream), _source(recording))}
     frame_us = np.empty(0, np.int64)
     if recording.has_video:
         frame_us = recording.frame_times() // 1000
@@ -33,8 +40,8 @@ def export_aedat4(recording: Recording, path: Path, stream: str) -> dict[str, in
             frame_us = recording.clock(stream).to_device(recording.frame_times()) // 1000
         first = recording.frame(0) if len(frame_us) else np.empty((1, 1))
         height, width = first.shape
-        streams[1] = Stream(FRAMES, "frames", (width, height), _source(recording))
-    streams[2] = Stream(TRIGGERS, "triggers", None, _source(recording))
+        streams[1] = Aedat4Stream(FRAMES, "frames", (width, height), _source(recording))
+    streams[2] = Aedat4Stream(TRIGGERS, "triggers", None, _source(recording))
     if len(frame_us) and int(frame_us.min()) < 0:
         raise ValueError("has frames before the event camera's clock started")
     with Aedat4Writer(path, streams) as file:

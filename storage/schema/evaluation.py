@@ -89,7 +89,7 @@ class CalibrationScores(Part):
     """Mean over windows, nats."""
 
 
-class Calibration(Part):
+class ProbabilityCalibration(Part):
     """Scores of test windows at the temperature that validation windows give."""
 
     temperature: Number | None
@@ -136,7 +136,7 @@ class SeedScores(Part):
     margin: Number | None
 
 
-class Spread(Part):
+class SeedSpread(Part):
     """A figure over seeds."""
 
     mean: Number | None
@@ -148,7 +148,7 @@ class Seeds(Part):
     """Every trained seed on the same windows."""
 
     each: tuple[SeedScores, ...]
-    spread: dict[str, Spread]
+    spread: dict[str, SeedSpread]
     """By `argmax`, `strict` and `margin`."""
 
 
@@ -210,7 +210,7 @@ class WindowScores(Classification):
     interval: Share
     """Strict accuracy."""
     reliability: tuple[LeadShare, ...]
-    calibration: Calibration
+    calibration: ProbabilityCalibration
     by_factor: dict[str, dict[str, Share]]
     """Strict accuracy by factor and level."""
     by_tenth: dict[str, tuple[Tenth, ...]]
@@ -345,7 +345,7 @@ class ExperimentScores(Part):
     """Every trained network on the same trials; written only where there are several."""
 
 
-class Deviation(Part):
+class SignedDeviation(Part):
     """Signed differences over trials, ms."""
 
     n: Int
@@ -357,8 +357,8 @@ class Deviation(Part):
 class DeviationByOnset(Part):
     """Of either onset."""
 
-    incipient: Deviation
-    gross: Deviation
+    incipient: SignedDeviation
+    gross: SignedDeviation
 
 
 class LabelErrors(DeviationByOnset):
@@ -368,7 +368,7 @@ class LabelErrors(DeviationByOnset):
     """Rules, joined by `+`."""
 
 
-class Coverage(Deviation):
+class ChangePointCoverage(SignedDeviation):
     """Change points of all papillae less the truth."""
 
     coverage: Number | None
@@ -384,10 +384,10 @@ class RuleErrors(Part):
     """The change point less the true start of the slip."""
     apart: DeviationByOnset
     """The paper's rule less the change point."""
-    papillae: Coverage
+    papillae: ChangePointCoverage
 
 
-class Choice(Part):
+class RuleChoice(Part):
     """Smoothing and margin chosen from a grid, and how they did on the trials that chose."""
 
     smoothing: Int
@@ -562,7 +562,7 @@ class Evaluation(Document):
     """Trials by the state of people's decisions; null where they are not applied."""
     detection: dict[str, Settings]
     """By campaign, with the chosen smoothing and margin."""
-    choices: dict[str, Choice | None]
+    choices: dict[str, RuleChoice | None]
     """By campaign; null where the protocol sets smoothing and margin."""
     detectors: DetectorComparison | None
     classifier: MarkerClassifier | None = None

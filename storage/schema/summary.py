@@ -16,8 +16,6 @@ from sliplab.storage.schema.evaluation import (
     AlarmRate,
     Baseline,
     ByClass,
-    Calibration,
-    Choice,
     DetectorComparison,
     DeviationByOnset,
     ExperimentScores,
@@ -29,6 +27,8 @@ from sliplab.storage.schema.evaluation import (
     MarkerClassifier,
     NoSlip,
     OnsetFigures,
+    ProbabilityCalibration,
+    RuleChoice,
     RuleErrors,
     SampleCounts,
     Seeds,
@@ -130,7 +130,7 @@ class Kinematic(NetworkWindows):
     trained_baselines: dict[str, TrainedBaseline] = Field(default_factory=dict)
     seeds: Seeds
     reliability: tuple[LeadShare, ...] = ()
-    calibration: Calibration
+    calibration: ProbabilityCalibration
     by_factor: dict[str, dict[str, Share]] = Field(default_factory=dict)
     by_tenth: dict[str, tuple[Tenth, ...]] = Field(default_factory=dict)
     no_slip: NoSlip | None = None
@@ -148,7 +148,7 @@ class DetectionRule(Part):
     """Source of both: `protocol`, `validation` or `test`."""
 
 
-class Network(Part):
+class NetworkSummary(Part):
     """Another network on the same trials."""
 
     title: str
@@ -162,7 +162,7 @@ class Network(Part):
     disturbance: Experiment
 
 
-class Difference(Part):
+class SettingDifference(Part):
     """A setting in which the network differs from the paper's."""
 
     setting: str
@@ -172,11 +172,11 @@ class Difference(Part):
     source: str
 
 
-class Paper(Part):
+class PaperSettings(Part):
     """The network's settings and the paper's."""
 
     preset: str | None
-    differences: tuple[Difference, ...]
+    differences: tuple[SettingDifference, ...]
     assumed: tuple[str, ...]
     """Settings that the paper does not say, with their values."""
 
@@ -199,7 +199,7 @@ class TrialOutcome(Part):
     late_gross_ms: Known = None
 
 
-class Trend(Part):
+class DriftTrend(Part):
     """Change over 100 trials, in percent of the median."""
 
     n: Int
@@ -219,14 +219,14 @@ class ReferenceTrial(Part):
     """After the motion began."""
 
 
-class References(Part):
+class ReferenceSummary(Part):
     """A campaign's reference trials, and wear."""
 
     trials: tuple[ReferenceTrial, ...]
-    wear: dict[str, Trend]
+    wear: dict[str, DriftTrend]
 
 
-class Hold(Part):
+class HoldSummary(Part):
     """Slips in the hold of a campaign's trials."""
 
     trials: Int
@@ -237,7 +237,7 @@ class Hold(Part):
     """The paper's onset from the hold's end less the one from its start."""
 
 
-class Labels(Part):
+class LabelSummary(Part):
     """The labels behind all figures."""
 
     error_ms: LabelErrors
@@ -245,7 +245,7 @@ class Labels(Part):
     source: dict[str, Int] = Field(default_factory=dict)
     reviewed: dict[str, Int] | None = None
     check: LabelCheck | None = None
-    holds: dict[str, Hold] = Field(default_factory=dict)
+    holds: dict[str, HoldSummary] = Field(default_factory=dict)
     given_within_ms: Number | None = None
     """Largest uncertainty that is stated of onsets that came with recordings; null where one states
     none; written only for such onsets."""
@@ -258,7 +258,7 @@ class HoldoutWindows(Part):
     argmax: Share
 
 
-class Holdout(Part):
+class HoldoutSummary(Part):
     """The store's network on another skin and seed."""
 
     trials: Int
@@ -285,7 +285,7 @@ class Sync(Part):
     worst_against_events_us: dict[str, Number]
 
 
-class Quality(Part):
+class QualitySummary(Part):
     """Trials and attempts."""
 
     planned: Int
@@ -342,11 +342,11 @@ class OneCameraSummary(Document):
     """The stream that was recorded."""
     left_out: tuple[StepLeftOut, ...]
     """Analyses that need the other stream."""
-    labels: Labels | None = None
+    labels: LabelSummary | None = None
     """Null where trials have no labels yet."""
     event_rates: dict[str, MotionRate] | None = None
     """By campaign; null without events."""
-    references: dict[str, References] = Field(default_factory=dict)
+    references: dict[str, ReferenceSummary] = Field(default_factory=dict)
     """Of campaigns with reference trials."""
     classifier: MarkerClassifier | None = None
     """Trained on marker displacements; only where frames alone were recorded. This key and the next
@@ -357,11 +357,11 @@ class OneCameraSummary(Document):
     disturbance: Experiment | None = None
     trials: tuple[TrialOutcome, ...] = ()
     detection: dict[str, DetectionRule] = Field(default_factory=dict)
-    choices: dict[str, Choice | None] = Field(default_factory=dict)
+    choices: dict[str, RuleChoice | None] = Field(default_factory=dict)
     clocks_us: dict[str, Number]
     """Uncertainty of each device's own clock against the sync box, worst trial, microseconds."""
     sync: Sync
-    quality: Quality
+    quality: QualitySummary
     planned: dict[str, Planned]
     timing_s: dict[str, Number] = Field(default_factory=dict)
     versions: dict[str, str]
@@ -375,19 +375,19 @@ class Summary(Document):
     kinematic: Kinematic
     gravity: Experiment
     disturbance: Experiment
-    networks: dict[str, Network] = Field(default_factory=dict)
-    paper: Paper | None = None
+    networks: dict[str, NetworkSummary] = Field(default_factory=dict)
+    paper: PaperSettings | None = None
     trials: tuple[TrialOutcome, ...]
-    references: dict[str, References] = Field(default_factory=dict)
-    labels: Labels
+    references: dict[str, ReferenceSummary] = Field(default_factory=dict)
+    labels: LabelSummary
     detection: dict[str, DetectionRule] = Field(default_factory=dict)
     """By campaign."""
-    choices: dict[str, Choice | None] = Field(default_factory=dict)
+    choices: dict[str, RuleChoice | None] = Field(default_factory=dict)
     """By campaign, what chose the rule; null where the protocol says it."""
     detectors: DetectorComparison | None = None
-    holdout: Holdout | None = None
+    holdout: HoldoutSummary | None = None
     sync: Sync
-    quality: Quality
+    quality: QualitySummary
     planned: dict[str, Planned] = Field(default_factory=dict)
     timing_s: dict[str, Number] = Field(default_factory=dict)
     """The one entry that differs between equal runs."""

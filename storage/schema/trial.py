@@ -69,7 +69,7 @@ Point = tuple[Number, Number]
 Size = tuple[Int, Int]
 
 
-class Counts(Part):
+class StreamCounts(Part):
     """Rows of each stream."""
 
     events: Int
@@ -89,14 +89,14 @@ class Gate(Part):
     """Of a clock's gate: how the device is timed."""
 
 
-class Quality(Part):
+class TrialQuality(Part):
     """The gates of a trial."""
 
     passed: Bool
     gates: dict[str, Gate] = Field(default_factory=dict)
 
 
-class Step(Part):
+class MotionStep(Part):
     """A phase of the motion, on the arm's clock."""
 
     phase: str
@@ -142,7 +142,7 @@ class DeviceRecord(Part):
         return self.pulses_seen is not None
 
 
-class Clocks(Part):
+class TrialClockMaps(Part):
     """The clocks of one trial: the time line, and the map of each device onto it."""
 
     reference: str | None = None
@@ -327,11 +327,11 @@ class TrialRecord(Document):
     """Depth at which the arm found contact, from the rig's plane."""
     depth_zero_sd_mm: Number | None = None
     """Standard deviation of the touches whose mean that is; None of a single touch."""
-    counts: Counts
-    clocks: Clocks
+    counts: StreamCounts
+    clocks: TrialClockMaps
     timing: RecordedTiming | None = None
-    quality: Quality
-    steps: tuple[Step, ...] = ()
+    quality: TrialQuality
+    steps: tuple[MotionStep, ...] = ()
     geometry: Geometry = Geometry()
     devices: dict[str, Any] | None = None
     """Settings that the devices reported, by device."""
@@ -392,5 +392,5 @@ class SyncResult(Document):
     """Checksum of the raw data that it is of."""
     refused: dict[str, str] = Field(default_factory=dict)
     """Reasons why devices could not be fitted again, by device."""
-    clocks: Clocks | None = None
+    clocks: TrialClockMaps | None = None
     """The clocks, where they differ from those of the record."""

@@ -63,10 +63,10 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     """
     began_ns = time.time_ns()
     found = [(campaign, _Listing.of(campaign)) for campaign in store.campaigns()]
-    known = _read_index(store) or _Known(pd.DataFrame())
+    known = _read_index(store) or _Index(pd.DataFrame())
     parts, problems = [], []
     for campaign, listing in found:
-        part = _Part(campaign, listing, known)
+        part = _CampaignRows(campaign, listing, known)
         parts.append(part)
         problems += part.look(unreadable is None)
     if unreadable is not None:
@@ -199,7 +199,7 @@ def _parquet(table: pd.DataFrame) -> bytes:
     return made.getvalue()
 
 
-class _Part:
+class _CampaignRows:
     """A campaign's part of the catalogue: rows of the index, and trials that have to be read.
 
     Attributes:
@@ -208,7 +208,7 @@ class _Part:
         fresh: rows that were read now, by trial.
     """
 
-    def __init__(self, campaign: Campaign, listing: _Listing, known: _Known) -> None:
+    def __init__(self, campaign: Campaign, listing: _Listing, known: _Index) -> None:
         self.campaign, self.listing = campaign, listing
         low, high, stamp = known.bounds.get(campaign.name, (0, 0, ""))
         names, keys = known.names[low:high], known.keys[low:high]
@@ -252,13 +252,15 @@ class _Part:
         return damaged + broken
 
 
-def _rebuilt(store: Store, parts: list[_Part], known: _Known, began_ns: int) -> pd.DataFrame:
+def _rebuilt(
+    store: Store, parts: list[_CampaignRows], known: _Index, began_ns: int
+) -> pd.DataFrame:
     """Return the table from the index and the rows that were read, and write it as the index."""
     old_rows, old_sync = known.rows(), known.sync()
     rows: list[Row] = []
     sync: list[str] = []
     keys: list[Any] = []
-    new = _Known(pd.DataFrame())
+    new = _Index(pd.DataFrame())
     for part in parts:
         first = len(rows)
         for name, key in zip(part.listing.names, part.listing.settled(began_ns), strict=True):
@@ -359,7 +361,7 @@ class _Listing:
 
 
 @dataclass
-class _Known:
+class _Index:
     """The index: the catalogue as it was, a row a trial, and the folders that it came from."""
 
     table: pd.DataFrame
@@ -399,7 +401,7 @@ def _stamp(path: Path, settled: bool = False) -> str:
     return f"{status.st_ino} {status.st_mtime_ns} {status.st_size}"
 
 
-def _read_index(store: Store) -> _Known | None:
+def _read_index(store: Store) -> _Index | None:
     """Read the index; None if there is none that can be used."""
     try:
         content = _path(store).read_bytes()
@@ -409,7 +411,7 @@ def _read_index(store: Store) -> _Known | None:
     return _parse(data) if hashlib.sha256(data).digest() == digest else None
 
 
-def _parse(data: bytes) -> _Known | None:
+def _parse(data: bytes) -> _Index | None:
     try:
         file = pq.ParquetFile(io.BytesIO(data))
         meta = json.loads(file.schema_arrow.metadata[_META])
@@ -420,13 +422,13 @@ def _parse(data: bytes) -> _Known | None:
         keys = np.stack([table[_INODE].to_numpy(), table[_CHANGED].to_numpy()], axis=1)
         bounds = {name: (low, high, sync) for name, low, high, sync in meta["campaigns"]}
         frame = table.drop_columns([_NAME, _INODE, _CHANGED]).to_pandas()
-        return _Known(frame, table[_NAME].to_pylist(), keys, bounds, data)
+        return _Index(frame, table[_NAME].to_pylist(), keys, bounds, data)
     except (ValueError, KeyError, TypeError, pa.ArrowException):
         return None
 
 
 def _write_index(
-    store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Known
+    store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Index
 ) -> None:
     """Write the index, where it can be written and reads again as it is."""
     frame = table.copy()

@@ -30,7 +30,7 @@ _MOST_TRIES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(Entry):
+class ControlRequest(Entry):
     """One request.
 
     Attributes:
@@ -59,7 +59,7 @@ def ask(
     why: str = "",
     campaign: str = "",
     trials: tuple[str, ...] = (),
-) -> Request:
+) -> ControlRequest:
     """Put a request into the store, after every one that exists.
 
     Raises:
@@ -69,7 +69,7 @@ def ask(
     number = max(journal.numbers(), default=0)
     for _ in range(_MOST_TRIES):
         number += 1
-        made = Request(
+        made = ControlRequest(
             number=number, kind=kind, campaign=campaign, trials=trials, **signature(who, why)
         )
         if journal.add(number, {k: value for k, value in vars(made).items() if k != "number"}):
@@ -77,13 +77,13 @@ def ask(
     raise OSError(f"{journal.folder}: no free number")
 
 
-def requests(store: Store) -> list[Request]:
+def requests(store: Store) -> list[ControlRequest]:
     """Return all requests in order; unreadable ones are left out."""
     journal, found = _journal(store), []
     for number in journal.numbers():
         try:
             data = read_json(journal.path(number))
-            made = Request(
+            made = ControlRequest(
                 number=number,
                 kind=data["kind"],
                 who=str(data["who"]),
@@ -100,13 +100,13 @@ def requests(store: Store) -> list[Request]:
     return found
 
 
-def answer(store: Store, request: Request, did: Json) -> Json:
+def answer(store: Store, request: ControlRequest, did: Json) -> Json:
     """Store the result of a request; an existing answer is not replaced."""
     write_new_json(_answer_path(store, request), {"when": now(), "by": user_name(), "did": did})
     return answered(store, request) or {"did": {}}
 
 
-def answered(store: Store, request: Request) -> Json | None:
+def answered(store: Store, request: ControlRequest) -> Json | None:
     """Return the answer to a request; None while it is open."""
     try:
         found = read_json(_answer_path(store, request))
@@ -117,12 +117,12 @@ def answered(store: Store, request: Request) -> Json | None:
     return found if isinstance(found.get("did"), dict) else {"did": {}}
 
 
-def open_requests(store: Store) -> list[Request]:
+def open_requests(store: Store) -> list[ControlRequest]:
     """Return the requests that have not been carried out yet, in order."""
     return [item for item in requests(store) if answered(store, item) is None]
 
 
-def paused(store: Store) -> Request | None:
+def paused(store: Store) -> ControlRequest | None:
     """Return the request by which the store is paused, if it is: the last one counts."""
     both = [item for item in requests(store) if item.kind in {"pause", "resume"}]
     return both[-1] if both and both[-1].kind == "pause" else None
@@ -218,5 +218,5 @@ def _journal(store: Store) -> Journal:
     return Journal(store.folder / FOLDER)
 
 
-def _answer_path(store: Store, request: Request) -> Path:
+def _answer_path(store: Store, request: ControlRequest) -> Path:
     return _journal(store).path(request.number, ".done")

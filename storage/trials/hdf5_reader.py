@@ -156,7 +156,7 @@ class RowFile:
     def __init__(self, path: Path, content: Any = None) -> None:
         self.path = path
         self._own: FileContent | None = None
-        self._opened: dict[str, Rows] = {}
+        self._opened: dict[str, Hdf5Column] = {}
         self._own_parts = set[bytes]()
         if content is not None:
             self._file = _open_content(content)
@@ -254,7 +254,7 @@ class RowFile:
             pass
         return True
 
-    def rows(self, name: str) -> Rows:
+    def rows(self, name: str) -> Hdf5Column:
         """Return a column, opened once.
 
         Raises:
@@ -266,7 +266,7 @@ class RowFile:
                 self._opened[name] = self._open(name)
         return self._opened[name]
 
-    def _open(self, name: str) -> Rows:
+    def _open(self, name: str) -> Hdf5Column:
         data = h5py.h5o.open(self._file, self._place(name))
         if not isinstance(data, h5py.h5d.DatasetID):
             raise NotOurs(f"{self.path}: {name} is no column")
@@ -276,7 +276,7 @@ class RowFile:
             raise NotOurs(f"{self.path}: {name} points outside the file")
         if (dtype := _plain(data, _NUMBERS)) is None:
             raise NotOurs(f"{self.path}: {name} does not contain numbers")
-        rows = Rows(data, f"{self.path}: {name}", dtype)
+        rows = Hdf5Column(data, f"{self.path}: {name}", dtype)
         value = rows.dtype.itemsize
         stated = value * math.prod(rows.shape)
         if stated > _LARGE and (stored := _stored_bytes(data, kept)) < stated:
@@ -389,7 +389,7 @@ def _kind_of(name: str) -> Kind | None:
     return _KINDS.get(name)
 
 
-class Rows:
+class Hdf5Column:
     """One column: a dataset whose first axis is read in ranges.
 
     Attributes:
@@ -573,7 +573,7 @@ class StreamReader:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def _rows(self, name: str) -> Rows:
+    def _rows(self, name: str) -> Hdf5Column:
         """Return a column, which is of the type and shape that belong to its name.
 
         Raises:
@@ -635,7 +635,7 @@ class StreamReader:
                 f"of its camera of {self._size_px[0]} x {self._size_px[1]} px"
             )
 
-    def _group(self, group: str, *parts: str) -> list[Rows]:
+    def _group(self, group: str, *parts: str) -> list[Hdf5Column]:
         """Return columns that have the same number of rows.
 
         Raises:
@@ -647,7 +647,7 @@ class StreamReader:
             raise NotOurs(f"{self._file.path}: {group} has columns of different lengths: {lengths}")
         return found
 
-    def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
+    def _bracket(self, marks: Hdf5Column, t_us: int, count: int) -> tuple[int, int]:
         """Return rows that enclose `t_us` after the offset, from the index or behind its end."""
         ms = t_us // 1000
         near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end

@@ -14,7 +14,7 @@ from sliplab.protocols.program import ACTING
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
-from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
+from sliplab.storage.schema.trial import SyncResult, TrialClockMaps, TrialRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
     F64,
@@ -152,7 +152,7 @@ class Recording:
         return self.raw_checksum if refitted is None else self.raw_checksum + refitted.key
 
     @cached_property
-    def clocks(self) -> Clocks:
+    def clocks(self) -> TrialClockMaps:
         """The clocks of the trial: fitted again, or else as the record has them."""
         refitted = self._refitted
         found = None if refitted is None else refitted.clocks

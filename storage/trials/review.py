@@ -28,7 +28,7 @@ class Overtaken(StoreError):
 
 
 @dataclass(frozen=True)
-class Onsets:
+class ReviewedOnsets:
     """Two onsets on the trial's time line, ns; None if there is none, or it is not known."""
 
     incipient_ns: int | None = None
@@ -45,7 +45,7 @@ class Onsets:
         return None
 
     @staticmethod
-    def parse(data: Json) -> Onsets:
+    def parse(data: Json) -> ReviewedOnsets:
         """Check onsets that were read.
 
         Raises:
@@ -57,7 +57,7 @@ class Onsets:
                 raise ValueError(f"{name} = {value!r}: must be whole nanoseconds")
             if value is not None and abs(value) >= 2**63:
                 raise ValueError(f"{name} = {value}: must be less than 2^63 ns in size")
-        return Onsets(**values)
+        return ReviewedOnsets(**values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +73,8 @@ class Decision(Entry):
 
     verdict: Verdict
     label: str
-    old: Onsets
-    new: Onsets
+    old: ReviewedOnsets
+    new: ReviewedOnsets
 
     def __str__(self) -> str:
         return self._summary(self.verdict)
@@ -87,8 +87,8 @@ def decide(
     verdict: Verdict,
     *,
     label: str,
-    old: Onsets,
-    new: Onsets,
+    old: ReviewedOnsets,
+    new: ReviewedOnsets,
     seen: int,
     who: str = "",
     why: str = "",
@@ -170,7 +170,7 @@ def _read(journal: Journal, number: int) -> Decision:
         if data["verdict"] not in get_args(Verdict):
             raise ValueError(f"verdict = {data['verdict']!r}")
         texts = {name: str(data[name]) for name in ("who", "when", "why", "host", "label")}
-        old, new = Onsets.parse(data["old"]), Onsets.parse(data["new"])
+        old, new = ReviewedOnsets.parse(data["old"]), ReviewedOnsets.parse(data["new"])
         if data["verdict"] == "adjust" and (problem := new.problem()) is not None:
             raise ValueError(problem)
     except StoreError:

@@ -74,9 +74,12 @@ def commit_foreign(
         {"format": 1, "trial": trial, "campaign": campaign.name, "experiment": experiment}
         | {"role": "imported", "block": 0, "repetition": 0, "attempt": 0, "simulated": simulated}
         | {"condition": dict(origin.get("condition", {})), "recorded_s": (span[1] - span[0]) / 1e9}
-        | {"counts": schema.Counts(events=len(events), frames=0, poses=0, pulses=0)}
-        | {"clocks": schema.Clocks(reference="event camera", events=clock)}
-        | {"quality": schema.Quality(passed=True), "geometry": schema.Geometry(event_px=event_px)}
+        | {"counts": schema.StreamCounts(events=len(events), frames=0, poses=0, pulses=0)}
+        | {"clocks": schema.TrialClockMaps(reference="event camera", events=clock)}
+        | {
+            "quality": schema.TrialQuality(passed=True),
+            "geometry": schema.Geometry(event_px=event_px),
+        }
         | {"imported": {"format": "adapter", "from": trial, "span_ns": span, **imported}}
     )
     record = schema.TrialRecord.model_validate(data)

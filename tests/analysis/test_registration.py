@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.registration import Deviation, campaign_deviations
+from sliplab.analysis.registration import RegistrationDeviation, campaign_deviations
 from sliplab.flows.register import register
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
@@ -80,13 +80,13 @@ def ids(data: Json, folder: Path) -> list[str]:
     return [trial.id for trial in load_plan(path)]
 
 
-def found(where: Campaign) -> list[Deviation]:
+def found(where: Campaign) -> list[RegistrationDeviation]:
     """All deviations from the first registration."""
     path, first = registrations(where)[0]
     return list(campaign_deviations(Collected(where), first, path))
 
 
-def named(where: Campaign) -> dict[str, Deviation]:
+def named(where: Campaign) -> dict[str, RegistrationDeviation]:
     """Deviations by name, without missing trials: most tests take none."""
     listed = [each for each in found(where) if each.what != "fewer trials than registered"]
     by_name = {each.what: each for each in listed}

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.interval_coverage import CLUSTERS, Coverage, alarm_rates, medians_by_world
+from benchmarks.interval_coverage import CLUSTERS, IntervalCoverage, alarm_rates, medians_by_world
 
 DRAWS = 1000
 
 
-def holds(row: Coverage) -> bool:
+def holds(row: IntervalCoverage) -> bool:
     """Return whether a coverage is compatible with 93 to 97 %, by its own 95 % interval."""
     low, high = row.span
     return low <= 0.97 and high >= 0.93
 
 
 @pytest.fixture(scope="module")
-def rates() -> list[Coverage]:
+def rates() -> list[IntervalCoverage]:
     return list(alarm_rates(DRAWS, sizes=(8, 24, 156)))
 
 
-def test_rate_of_24_clusters_or_more_is_held_in_95_percent(rates: list[Coverage]) -> None:
+def test_rate_of_24_clusters_or_more_is_held_in_95_percent(rates: list[IntervalCoverage]) -> None:
     rows = [row for row in rates if row.clusters >= 24]
     assert {row.case for row in rows} > CLUSTERS.keys()
     assert [row for row in rows if not holds(row)] == []
 
 
-def test_rate_of_few_clusters_is_held_as_often_as_documented(rates: list[Coverage]) -> None:
+def test_rate_of_few_clusters_is_held_as_often_as_documented(rates: list[IntervalCoverage]) -> None:
     for row in (row for row in rates if row.clusters < 24):
         if "15 %" in row.case and row.clusters == 8:
             assert row.share < 0.8, "in one of four data sets no cluster has an alarm"

@@ -15,11 +15,19 @@ import pytest
 
 from benchmarks import twin_studies
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
-from benchmarks.twin_studies import FIGURES, ONSETS, FloatArray, Outcome, lines, medians_ms, within
+from benchmarks.twin_studies import (
+    FIGURES,
+    ONSETS,
+    FloatArray,
+    NetworkOutcome,
+    lines,
+    medians_ms,
+    within,
+)
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
-from sliplab.analysis.detectors.smoothing_rule import Found
-from sliplab.analysis.evaluation.trials import Judged
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
+from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
@@ -90,14 +98,14 @@ def test_medians_of_rounded_times_come_near_those_of_exact_ones() -> None:
     assert ours < 1.0 < 2.0 < single
 
 
-def outcome(hits: FloatArray, times: FloatArray) -> Outcome:
+def outcome(hits: FloatArray, times: FloatArray) -> NetworkOutcome:
     """Return an outcome whose times are the same for each figure."""
     trials = [f"trial{k}" for k in range(hits.shape[1])]
     values = {
         name: pd.DataFrame(hits if figure.time is None else times, columns=trials)
         for name, figure in FIGURES.items()
     }
-    return Outcome(values, pd.Series(50.0, trials), 10.0)
+    return NetworkOutcome(values, pd.Series(50.0, trials), 10.0)
 
 
 def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
@@ -107,7 +115,7 @@ def test_a_trial_that_only_one_study_has_leaves_the_others_in_pairs() -> None:
     fewer = outcome(np.full((2, 40), 45.0), times)
     for name, values in fewer.values.items():
         fewer.values[name] = values.drop(columns=["trial3", "trial17"])
-    fewer = Outcome(fewer.values, fewer.windows.drop(["trial3", "trial17"]), 10.0)
+    fewer = NetworkOutcome(fewer.values, fewer.windows.drop(["trial3", "trial17"]), 10.0)
     assert fewer.figure("accuracy") == pytest.approx(90.0)
     assert fewer.against(own, "accuracy") == pytest.approx((0.0, 0.0))
     apart = outcome(np.full((2, 40), 45.0), times[:, ::-1])
@@ -137,7 +145,7 @@ def test_times_count_from_the_onset_that_is_asked_for() -> None:
     ms = 1_000_000
     paper = OnsetReference(TrueSlip(500 * ms, 900 * ms, 2000 * ms))
     point = OnsetReference(TrueSlip(380 * ms, 815 * ms, 2000 * ms))
-    found = Found(600 * ms, 920 * ms)
+    found = DetectedOnsets(600 * ms, 920 * ms)
     decided = [
         Decided(found, {"paper": paper, "change_point": point}, 30 * ms),
         Decided(found, {"paper": paper}, 30 * ms),
@@ -147,8 +155,10 @@ def test_times_count_from_the_onset_that_is_asked_for() -> None:
     samples: Any = SimpleNamespace(
         y=np.array([0, 1, 2, 2]), trial=np.array([0, 0, 0, 1]), trials=trials
     )
-    judged = [Judged(np.array([[9, 0, 0], [0, 9, 0], [0, 9, 0], [0, 0, 9]]), samples, rows)]
-    by_paper, by_point = (Outcome.of(judged, [decided], onset) for onset in ONSETS)
+    judged = [
+        EvaluatedTrials(np.array([[9, 0, 0], [0, 9, 0], [0, 9, 0], [0, 0, 9]]), samples, rows)
+    ]
+    by_paper, by_point = (NetworkOutcome.of(judged, [decided], onset) for onset in ONSETS)
     assert by_paper.values["kinematic"].to_dict("list") == {"a": [100.0], "b": [100.0]}
     assert by_paper.values["gross"].to_dict("list") == {"a": [20.0], "b": [20.0]}
     assert by_point.values["kinematic"]["a"].tolist() == [220.0]
@@ -156,7 +166,7 @@ def test_times_count_from_the_onset_that_is_asked_for() -> None:
     assert by_point.values["gross"]["b"].isna().all()
     assert by_paper.figure("accuracy") == by_point.figure("accuracy") == pytest.approx(75.0)
     assert by_paper.figures()["gravity"] is None
-    of_windows = Outcome.of([Judged(judged[0].counts, samples, [])], [()], "paper")
+    of_windows = NetworkOutcome.of([EvaluatedTrials(judged[0].counts, samples, [])], [()], "paper")
     assert of_windows.figure("accuracy") == pytest.approx(75.0)
     assert of_windows.figures()["kinematic"] is None
 

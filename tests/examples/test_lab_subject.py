@@ -15,7 +15,7 @@ from sliplab.analysis.report.page import Rendered
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
 from sliplab.flows.cli import app as cli
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome, searches
+from sliplab.flows.study import StudyOutcome, searches
 from sliplab.plugins.bench.registry import known, make_detector
 from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
@@ -23,7 +23,7 @@ from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.examples.conftest import EXAMPLES
 
-Ran = tuple[list[RunRequest], Outcome]
+Ran = tuple[list[RunRequest], StudyOutcome]
 
 
 @pytest.fixture

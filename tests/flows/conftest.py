@@ -25,11 +25,11 @@ from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
 from sliplab.flows.running import parallel_map  # noqa: E402
 from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
-from sliplab.flows.study import Outcome, study  # noqa: E402
+from sliplab.flows.study import StudyOutcome, study  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
 from sliplab.storage.trials.store import Store  # noqa: E402
 
-Ran = tuple[list[RunRequest], Outcome]
+Ran = tuple[list[RunRequest], StudyOutcome]
 """What the fixture `ran` gives: the runs of the small study, and how they ended."""
 
 configure_prefect(Path(_HOME))
@@ -96,7 +96,7 @@ def write(path: Path, data: dict[str, Any]) -> Path:
     return path
 
 
-def run_small_study(folder: Path, rig_path: Path) -> tuple[list[RunRequest], Outcome]:
+def run_small_study(folder: Path, rig_path: Path) -> tuple[list[RunRequest], StudyOutcome]:
     """Run both small campaigns through every step."""
     protocols = [
         write(folder / "tiny.yaml", tiny()),

@@ -13,7 +13,7 @@ from jsonschema import Draft7Validator
 from sliplab.analysis.campaigns import class_names, collected
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.evaluation.classes import class_evaluation_of, whole_recordings
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_class_samples
@@ -54,7 +54,7 @@ def copied(judged: Store, tmp_path: Path) -> Store:
 
 def samples(store: Store, split: str) -> SampleSet:
     """The samples of a part of the split."""
-    return load_class_samples(Labels(store), collected(store), split)
+    return load_class_samples(StoreLabels(store), collected(store), split)
 
 
 def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: Store) -> None:

@@ -20,7 +20,7 @@ from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import against, read_one_camera, report
 from sliplab.flows.running.console import plain
-from sliplab.flows.study import Outcome, study
+from sliplab.flows.study import StudyOutcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
@@ -42,7 +42,7 @@ def rig_with(camera: str, folder: Path) -> Path:
     return write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
 
 
-def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
+def take(camera: str, folder: Path) -> tuple[Store, StudyOutcome]:
     """Three slides and two plates, from protocol to report."""
     slides = tiny()
     slides["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
@@ -63,7 +63,9 @@ def take(camera: str, folder: Path) -> tuple[Store, Outcome]:
 
 
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Store, Outcome]]:
+def studied(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str], tuple[Store, StudyOutcome]]:
     """The study of each camera, made when it is first asked for."""
     return cache(lambda camera: take(camera, tmp_path_factory.mktemp(camera)))
 
@@ -72,7 +74,7 @@ Take = Callable[[str], Store]
 
 
 @pytest.fixture
-def taken(studied: Callable[[str], tuple[Store, Outcome]], tmp_path: Path) -> Take:
+def taken(studied: Callable[[str], tuple[Store, StudyOutcome]], tmp_path: Path) -> Take:
     """A copy of a camera's store, to be changed at will."""
 
     def copied(camera: str) -> Store:
@@ -83,7 +85,7 @@ def taken(studied: Callable[[str], tuple[Store, Outcome]], tmp_path: Path) -> Ta
 
 @pytest.mark.parametrize("camera", [pytest.param("events", marks=pytest.mark.long), "frames"])
 def test_a_study_with_one_camera_runs_to_its_report(
-    camera: str, studied: Callable[[str], tuple[Store, Outcome]]
+    camera: str, studied: Callable[[str], tuple[Store, StudyOutcome]]
 ) -> None:
     store, outcome = studied(camera)
     states = {row.name: (row.state, row.note) for row in outcome.rows}
@@ -232,7 +234,7 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_report_is_made_again_only_when_something_changed(
-    studied: Callable[[str], tuple[Store, Outcome]],
+    studied: Callable[[str], tuple[Store, StudyOutcome]],
 ) -> None:
     store, _ = studied("events")
     assert {each.beyond for each in against(store, store.folder)[0].figures} <= {False, None}

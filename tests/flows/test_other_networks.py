@@ -15,7 +15,7 @@ import yaml
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.evaluation.networks import STEP
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import spike_counts
@@ -61,7 +61,7 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
     assert rules.keys() == {"tiny", "tiny_gravity"}
     fitted = model_file.load(store.folder / "models" / "paper-seed0.pt")
     assert (fitted.network.outputs_per_class, fitted.network.biases) == (1, False)
-    test = load_samples(Labels(store), campaigns, "test")
+    test = load_samples(StoreLabels(store), campaigns, "test")
     counts = spike_counts(restore(fitted), test.x)
     expected = metrics.score(counts, test.y, 2.0).to_json()
     assert {name: found["windows"][name] for name in expected} == json.loads(json.dumps(expected))
@@ -106,7 +106,7 @@ def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
     said = json.loads(done.stdout)
     assert (said["engine"], said["same_as_sinabs"], said["margin"]["tiny"]) == ("sinabs", True, 2.0)
     net = papers(0.1, cells=20, steps=30)
-    test = load_samples(Labels(store), campaigns, "test")
+    test = load_samples(StoreLabels(store), campaigns, "test")
     expected = by_hand(net, test.x, 16)
     assert said["accuracy"] == metrics.accuracy(expected, test.y, 2.0).to_json()
     assert len(np.unique(expected, axis=0)) > 3

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from sliplab.analysis.campaigns import Collected, collected
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import GROSS, NO_SLIP
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.storage.schema.label import LABELS, TrialLabel
@@ -98,7 +98,9 @@ def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
         trial.split for trial, _ in sorted(item.trials, key=lambda t: t[0].id)
     ]
     # the same windows: those of the two stores begin within the rounding of both clocks
-    ours, theirs = (load_samples(Labels(each), collected(each), "train") for each in (here, store))
+    ours, theirs = (
+        load_samples(StoreLabels(each), collected(each), "train") for each in (here, store)
+    )
     # an event file goes on for some windows after the slide, where a collected trial has ended
     counts = [np.bincount(part.y, minlength=3) for part in (ours, theirs)]
     np.testing.assert_array_equal(counts[0][:GROSS], counts[1][:GROSS])

@@ -15,7 +15,7 @@ import pytest
 from sliplab.analysis.campaigns import collected, training_campaigns
 from sliplab.analysis.evaluation import baselines as window_baselines
 from sliplab.analysis.labels.label_errors import read_check
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
@@ -204,7 +204,7 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(ran: Ran) -> None:
     used = training_campaigns(collected(store))
     found: dict[str, set[tuple[str, str]]] = {}
     for split in ("train", "validation", "test"):
-        samples = load_samples(Labels(store), used, split)
+        samples = load_samples(StoreLabels(store), used, split)
         known, of = by_id(split_trials(used, split)), samples.trial
         for k in np.unique(of).tolist():
             item, trial, recording = known[samples.trials[k]]
@@ -244,7 +244,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
     ran: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
-    monkeypatch.setattr("sliplab.analysis.networks.models.Model.fresh", False)
+    monkeypatch.setattr("sliplab.analysis.networks.models.ModelOnDisk.fresh", False)
     monkeypatch.setattr("sliplab.analysis.networks.gradients.devices", lambda: ["cuda", "cuda:0"])
     with pytest.raises(
         InputError,

@@ -10,7 +10,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.evaluation.windows import kept_counts
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.windows.dataset import TrialId
 from sliplab.analysis.windows.sample_sets import load_samples, split_trials
@@ -19,7 +19,7 @@ from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.train import train
-from sliplab.storage.trials.review import Onsets, decide
+from sliplab.storage.trials.review import ReviewedOnsets, decide
 from sliplab.storage.trials.store import Store
 from tests.flows.conftest import tiny, write
 
@@ -42,8 +42,14 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
     campaigns = collected(store)
     label(store, campaigns)
     rejected, recording = list(campaigns[0].of_split("test"))[-1]
-    key = Labels(store).key(campaigns[0], recording)
-    known = {"label": key, "old": Onsets(), "new": Onsets(), "seen": 0, "who": "a person"}
+    key = StoreLabels(store).key(campaigns[0], recording)
+    known = {
+        "label": key,
+        "old": ReviewedOnsets(),
+        "new": ReviewedOnsets(),
+        "seen": 0,
+        "who": "a person",
+    }
     decide(store, "first", rejected.id, "reject", **known, why="the skin was dirty")
     train(store, campaigns, reviewed=True)
     return store
@@ -63,7 +69,7 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
     assert rows.keys() == expected
     kept = kept_counts(two, found.key)
     assert kept is not None
-    labels = Labels(two, reviewed=True)
+    labels = StoreLabels(two, reviewed=True)
     trials = [tuple(names) for names in kept["trials"].tolist()]
     for item, trial, recording in split_trials(campaigns, "test"):
         ours = int(np.count_nonzero(kept["trial"] == trials.index((item.name, trial.id))))
@@ -89,7 +95,7 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
 def test_each_sample_says_its_trial(two: Store) -> None:
     """The last window of no slip ends at the onset of its own trial."""
     campaigns = collected(two)
-    labels = Labels(two, reviewed=True)
+    labels = StoreLabels(two, reviewed=True)
     for split in ("train", "validation", "test"):
         samples = load_samples(labels, campaigns, split)
         length_ns = campaigns[0].settings.windows.length_ms * 1_000_000

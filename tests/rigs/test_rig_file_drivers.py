@@ -13,7 +13,7 @@ from sliplab.protocols.plan import load_plan
 from sliplab.protocols.program import Move
 from sliplab.rigs.build import _check_grade
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.basler.frame_time import Stamping
+from sliplab.rigs.devices.basler.frame_time import FrameStamping
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT
@@ -85,15 +85,15 @@ def test_a_real_rig_is_not_simulated_and_a_loopback_is(tmp_path: Path) -> None:
 class _Camera:
     """A frame camera of which only its stamps matter."""
 
-    def __init__(self, stamping: Stamping) -> None:
+    def __init__(self, stamping: FrameStamping) -> None:
         self.stamping = stamping
 
 
 def test_a_camera_whose_times_are_worse_than_promised_is_refused(tmp_path: Path) -> None:
     file = load(loopback(), tmp_path / "rig.yaml")
-    fine: Any = _Camera(Stamping("chunk", "hardware trigger"))
+    fine: Any = _Camera(FrameStamping("chunk", "hardware trigger"))
     _check_grade(file.timing.frames, fine, "timing.frames")
-    poor: Any = _Camera(Stamping("host arrival", "host arrival"))
+    poor: Any = _Camera(FrameStamping("host arrival", "host arrival"))
     with pytest.raises(RigError, match=r"'host arrival'.*write timing.frames: host arrival"):
         _check_grade(file.timing.frames, poor, "timing.frames")
     simulated: Any = object()

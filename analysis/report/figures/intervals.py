@@ -119,7 +119,7 @@ def _room(panel: Panel) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Share:
+class ShareInterval:
     """A share with its interval: 0..1, None where it is not known."""
 
     name: str
@@ -129,7 +129,7 @@ class Share:
 
 
 def shares(
-    groups: Mapping[str, Sequence[Share]],
+    groups: Mapping[str, Sequence[ShareInterval]],
     label: str,
     *,
     simulated: bool,

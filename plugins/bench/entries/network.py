@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Labelled, Predictions, Reading, cusum, learn
+from sliplab.analysis.detectors.detectors import Predictions, Reading, TrialWithSlip, cusum, learn
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import lead_of
 from sliplab.analysis.metrics.classification import INCIPIENT, NO_SLIP, winners
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.network import parameters
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
@@ -46,7 +46,7 @@ class Spiking(WindowDetector):
     def __init__(self, settings: AnalysisSettings, stride_ms: int, by_paper: bool) -> None:
         super().__init__(settings.windows, stride_ms)
         self.settings, self._by_paper = settings, by_paper
-        self._engine: Engine | None = None
+        self._engine: SpikeEngine | None = None
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         """See `Detector`."""
@@ -66,7 +66,7 @@ class Spiking(WindowDetector):
             settings.training.seeds[0],
         )
         self._net = training.restore(self.fitted)
-        self._engine = Engine(self._net, settings.windows.cells)
+        self._engine = SpikeEngine(self._net, settings.windows.cells)
         rows = np.random.default_rng(0).permutation(len(val))[:COUNTED]
         self._counted = val.windows.take(rows)
 
@@ -92,7 +92,7 @@ class Spiking(WindowDetector):
         return Cost(operations, weights * WEIGHT_BYTES)
 
 
-class Paper(Spiking):
+class PaperEntry(Spiking):
     """The paper's network and rule as published (`analysis: {preset: paper}`).
 
     The evidence is the lead of incipient slip where the rule calls it, and nothing elsewhere: the
@@ -147,7 +147,7 @@ class Ours(Spiking):
         self._level = float(found[-1]) if len(found) else self._level
         return found
 
-    def _labelled(self, scene: Scene) -> Labelled:
+    def _labelled(self, scene: Scene) -> TrialWithSlip:
         """Return a scene's consecutive windows with its true slip."""
         length_us = self.windows.length_ms * 1000
         starts = np.arange(0, scene.end_us - length_us + 1, length_us, dtype=np.int64)
@@ -156,11 +156,11 @@ class Ours(Spiking):
         predictions = Predictions(self.counts(x), x.totals, (starts + length_us) * 1000)
         onset_us = slip.incipient_us(self._by_paper)
         true = TrueSlip(onset_us * 1000, slip.gross_us * 1000, scene.end_us * 1000)
-        return Labelled(predictions, true)
+        return TrialWithSlip(predictions, true)
 
 
-class PaperByPhysicalOnset(Paper):
-    """`Paper`, trained on the first tip's sliding: what the label alone changes."""
+class PaperByPhysicalOnset(PaperEntry):
+    """`PaperEntry`, trained on the first tip's sliding: what the label alone changes."""
 
     def __init__(self) -> None:
         super().__init__(by_paper=False)

@@ -41,7 +41,7 @@ MOST = 1_000_000
 _PIPE = 1 << 16
 
 
-class Program(Detector):
+class ExternalProcess(Detector):
     """A process that speaks the protocol of the module's docstring.
 
     Args:

@@ -47,7 +47,7 @@ class Fall(WindowDetector):
         """Return the quantity that falls, (n,)."""
 
 
-class Rate(Fall):
+class EventRate(Fall):
     """Events of a window."""
 
     def measured(self, x: SparseWindows) -> npt.NDArray[np.float64]:

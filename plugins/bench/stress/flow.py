@@ -22,10 +22,10 @@ from sliplab.analysis.detectors.predictions import (
     predict_trials,
     prediction_request,
 )
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.models import Model, choose_model, wanted_models
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_models
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.judge_network import spike_keeper
@@ -46,7 +46,7 @@ NAME = "stress"
 
 
 @dataclass(frozen=True)
-class Request:
+class StressRequest:
     """Request of a stress test, checked before anything moves.
 
     Attributes:
@@ -62,7 +62,7 @@ class Request:
 
 def request(
     store: Store, campaigns: list[Collected], protocol: Path, rig: Path | None, out: Path | None
-) -> Request:
+) -> StressRequest:
     """Check a request.
 
     Args:
@@ -96,10 +96,10 @@ def request(
     if taken.plan.protocol.analysis.windows != item.settings.windows:
         text = f"must be those of the campaign '{item.name}', on which the networks were trained"
         raise InputError("--protocol", "analysis.windows", str(protocol), text)
-    return Request(store, campaigns, taken, out)
+    return StressRequest(store, campaigns, taken, out)
 
 
-def measure_stress(asked: Request) -> StressRecord:
+def measure_stress(asked: StressRequest) -> StressRecord:
     """Take and label the trials that are missing, and judge the detectors.
 
     Raises:
@@ -107,7 +107,7 @@ def measure_stress(asked: Request) -> StressRecord:
     """
     make_folder(asked.out)
     disturbed, (campaign,) = retake([asked.taken])
-    labels = Labels(disturbed)
+    labels = StoreLabels(disturbed)
     trials = [
         (trial, recording, found)
         for trial, recording in campaign.of_split("test")
@@ -149,7 +149,7 @@ def measure_stress(asked: Request) -> StressRecord:
 
 
 def _stress_trial(
-    plan: Plan, trial: Trial, recording: Recording, labels: Labels, campaign: Collected
+    plan: Plan, trial: Trial, recording: Recording, labels: StoreLabels, campaign: Collected
 ) -> StressTrial | None:
     """A trial with its nuisance and onsets; None where the label lacks the incipient one.
 
@@ -176,7 +176,7 @@ Predicted = list[tuple[StressTrial, Predictions]]
 
 
 def _predicted(
-    disturbed: Store, campaign: Collected, trials: Trials, model: Model, stride_ms: int
+    disturbed: Store, campaign: Collected, trials: Trials, model: ModelOnDisk, stride_ms: int
 ) -> Predicted:
     """Spikes of a network in all windows of the trials."""
     windows = model.settings.windows
@@ -194,7 +194,7 @@ def _predicted(
 
 
 def _accuracy(
-    title: str, model: Model, labels: Labels, campaign: Collected, trials: Trials
+    title: str, model: ModelOnDisk, labels: StoreLabels, campaign: Collected, trials: Trials
 ) -> Iterator[StressAccuracy]:
     """Strict accuracy of a network by nuisance and strength, with intervals over trials."""
     samples = load_samples(labels, [campaign], "test")

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Detector, Predictions, first_above
+from sliplab.analysis.detectors.detectors import EvidenceDetector, Predictions, first_above
 from sliplab.analysis.detectors.latency import TrueSlip, median_with_lost
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.intervals import exact_interval
@@ -49,14 +49,16 @@ class StressTrial:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialDetection:
     """A detector's result in a trial: false alarms, and the time of a detection in time."""
 
     false_alarms: int
     detected_ns: int | None
 
 
-def alarms(detector: Detector, level: float, predictions: Predictions) -> npt.NDArray[np.int64]:
+def alarms(
+    detector: EvidenceDetector, level: float, predictions: Predictions
+) -> npt.NDArray[np.int64]:
     """Times of all alarms, the ends of their windows, ns, (n,)."""
     found, start = [], 0
     end_ns = predictions.end_ns
@@ -72,7 +74,7 @@ def alarms(detector: Detector, level: float, predictions: Predictions) -> npt.ND
     return np.array(found, np.int64)
 
 
-def outcome(at_ns: npt.NDArray[np.int64], slip: TrueSlip, tolerance_ns: int) -> Outcome:
+def outcome(at_ns: npt.NDArray[np.int64], slip: TrueSlip, tolerance_ns: int) -> TrialDetection:
     """Judge the alarms of a trial.
 
     Args:
@@ -82,11 +84,11 @@ def outcome(at_ns: npt.NDArray[np.int64], slip: TrueSlip, tolerance_ns: int) -> 
     early = at_ns < slip.incipient_ns - tolerance_ns
     later = at_ns[~early]
     caught = len(later) > 0 and int(later[0]) < slip.gross_ns
-    return Outcome(int(early.sum()), int(later[0]) if caught else None)
+    return TrialDetection(int(early.sum()), int(later[0]) if caught else None)
 
 
 def figures(
-    nuisance: str, strength: float | None, trials: Sequence[tuple[StressTrial, Outcome]]
+    nuisance: str, strength: float | None, trials: Sequence[tuple[StressTrial, TrialDetection]]
 ) -> StressFigures:
     """Summarise a detector's outcomes."""
     per_hour = alarm_rate(
@@ -137,7 +139,7 @@ def stressed(
     network: str,
     rule: str,
     stride_ms: int,
-    judged: Sequence[tuple[StressTrial, Outcome]],
+    judged: Sequence[tuple[StressTrial, TrialDetection]],
 ) -> StressDetector:
     """A detector's figures over all trials, each nuisance, and each of its strengths."""
     found = []

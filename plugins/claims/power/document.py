@@ -8,7 +8,7 @@ MOST_OPEN = 0.5
 """A claim that is open at the end of more campaigns than this share is out of the plan's reach."""
 
 
-class Spread(Part):
+class TrialSpread(Part):
     """A number of trials over the drawn campaigns; null: more than the plan has."""
 
     low: Int | None
@@ -35,7 +35,7 @@ class ClaimPower(Part):
     """Half the width that is claimed; null for other claims."""
     known: Int
     """Trials of the pilot with this figure."""
-    trials: Spread
+    trials: TrialSpread
     """After which it is called."""
     called: tuple[Int | None, ...]
     """The same of each campaign; null: never."""
@@ -54,7 +54,7 @@ class ClaimPower(Part):
         return self.never > MOST_OPEN
 
 
-class CurvePoint(Part):
+class LearningPoint(Part):
     """Accuracy of a classifier that some of the training trials trained."""
 
     trials: Int
@@ -69,7 +69,7 @@ class Learning(Part):
 
     classifier: str
     test_trials: Int
-    points: tuple[CurvePoint, ...]
+    points: tuple[LearningPoint, ...]
     floor: Number
     scale: Number
     exponent: Number
@@ -79,7 +79,7 @@ class Learning(Part):
     """Accuracy with so many; 95 % between:"""
     low: Number
     high: Number
-    line: tuple[CurvePoint, ...]
+    line: tuple[LearningPoint, ...]
     """Of the fit."""
 
 
@@ -109,7 +109,7 @@ class PowerRecord(Document):
     """Of motion of the whole plan; maintenance and people's work are left out."""
     notes: tuple[str, ...]
     claims: tuple[ClaimPower, ...]
-    together: Spread
+    together: TrialSpread
     """Trials after which all claims end a campaign."""
     ended: tuple[Int | None, ...]
     """The same of each campaign; null: never."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.plugins.claims.document import ClaimState
-from sliplab.plugins.claims.evidence import Grid
-from sliplab.plugins.claims.power.document import MOST_OPEN, ClaimPower, Spread, WidthLine
-from sliplab.plugins.claims.power.resampling import ONE_SESSION, Pilot, Sessions
-from sliplab.plugins.claims.simulated import Course, claims_of, course
+from sliplab.plugins.claims.evidence import TrialGrid
+from sliplab.plugins.claims.power.document import MOST_OPEN, ClaimPower, TrialSpread, WidthLine
+from sliplab.plugins.claims.power.resampling import ONE_SESSION, PilotFigures, Sessions
+from sliplab.plugins.claims.simulated import CampaignCourse, claims_of, course
 from sliplab.plugins.claims.states import is_called, states
 from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES, Claim
@@ -25,7 +25,7 @@ POINTS = 8
 
 
 @dataclass(frozen=True)
-class Drawn:
+class CampaignDraw:
     """A campaign that was drawn.
 
     Attributes:
@@ -47,20 +47,20 @@ class Drawing:
     """Campaigns of a plan that are drawn from a pilot; equal numbers give equal ones."""
 
     plan: Plan
-    pilot: Pilot
+    pilot: PilotFigures
     seed: int
     sessions: Sessions = ONE_SESSION
 
-    def campaign(self, number: int) -> Drawn:
+    def campaign(self, number: int) -> CampaignDraw:
         """Draw a campaign."""
-        grid = Grid.of(self.plan)
+        grid = TrialGrid.of(self.plan)
         rng = np.random.default_rng([self.seed, number])
         in_blocks = self.plan.protocol.collection.adaptive is None
         values = self.pilot.without(self.sessions).campaign(grid, rng, in_blocks=in_blocks)
         over_time = self.pilot.over_time(self.plan, grid, self.sessions, rng)
         found = course(self.plan, grid, values, over_time)
         looks = found.evidence.looks
-        return Drawn(
+        return CampaignDraw(
             tuple(None if it.look is None else int(looks[it.look]) for it in found.claims),
             tuple(it.state for it in found.claims),
             len(found.evidence.taken),
@@ -68,7 +68,7 @@ class Drawing:
             self._widths(found) if number < LINES else (),
         )
 
-    def _widths(self, found: Course) -> tuple[WidthLine, ...]:
+    def _widths(self, found: CampaignCourse) -> tuple[WidthLine, ...]:
         """Return the widths of each claim along a campaign, at some of its looks."""
         looks, stopping = found.evidence.looks, claims_of(self.plan)
         places = np.unique(np.linspace(0, len(looks) - 1, POINTS).round().astype(np.int64))
@@ -84,14 +84,14 @@ def _half(state: ClaimState) -> float | None:
     return None if state.low is None or state.high is None else 0.5 * (state.high - state.low)
 
 
-def spread(trials: Sequence[int | None]) -> Spread:
+def spread(trials: Sequence[int | None]) -> TrialSpread:
     """Return 10, 50 and 90 % of numbers of trials, None being more than any."""
     ordered = sorted(trials, key=lambda n: math.inf if n is None else n)
     low, median, high = (ordered[max(math.ceil(p * len(ordered)) - 1, 0)] for p in SHARES)
-    return Spread(low=low, median=median, high=high)
+    return TrialSpread(low=low, median=median, high=high)
 
 
-def claim_powers(drawing: Drawing, campaigns: Sequence[Drawn]) -> tuple[ClaimPower, ...]:
+def claim_powers(drawing: Drawing, campaigns: Sequence[CampaignDraw]) -> tuple[ClaimPower, ...]:
     """Return the statistics of each claim over drawn campaigns."""
     found = []
     for k, claim in enumerate(claims_of(drawing.plan).claims):
@@ -118,10 +118,10 @@ def claim_powers(drawing: Drawing, campaigns: Sequence[Drawn]) -> tuple[ClaimPow
     return tuple(found)
 
 
-def _repetitions(drawing: Drawing, campaigns: Sequence[Drawn], k: int) -> int | None:
+def _repetitions(drawing: Drawing, campaigns: Sequence[CampaignDraw], k: int) -> int | None:
     """Return the repetitions that would call an open claim in half of the campaigns."""
     claim = claims_of(drawing.plan).claims[k]
-    grid = Grid.of(drawing.plan)
+    grid = TrialGrid.of(drawing.plan)
     kinds = int(grid.condition.max()) + 1
     needed = sorted(
         it.trials * (1.0 if is_called(it.states[k]) else more_trials(claim, it.states[k]))

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import stale_trials
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
@@ -28,13 +28,13 @@ from sliplab.flows.running.run_records import timed
 from sliplab.plugins.claims import trial_figures as figures
 from sliplab.plugins.claims.blocks import F64, I64
 from sliplab.plugins.claims.document import TrialFigures
-from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.power import learning
 from sliplab.plugins.claims.power.document import Learning, PowerRecord
-from sliplab.plugins.claims.power.drawing import SHARES, Drawing, Drawn, claim_powers, spread
+from sliplab.plugins.claims.power.drawing import SHARES, CampaignDraw, Drawing, claim_powers, spread
 from sliplab.plugins.claims.power.resampling import (
     ONE_SESSION,
-    Pilot,
+    PilotFigures,
     Sessions,
     sessions_text,
     shared_axes,
@@ -76,7 +76,7 @@ PilotTrial = tuple[Collected, Trial, Recording]
 
 
 @dataclass(frozen=True)
-class Request:
+class PowerRequest:
     """Request of a power analysis, checked.
 
     Attributes:
@@ -182,7 +182,7 @@ def request(
     seed: int = 1,
     classifier: Classifier | None = LOGISTIC,
     sessions: Sessions = ONE_SESSION,
-) -> Request:
+) -> PowerRequest:
     """Check a request.
 
     Raises:
@@ -215,7 +215,7 @@ def request(
     adaptive = plan.protocol.collection.adaptive is not None
     count = drawn or (ADAPTIVE_CAMPAIGNS if adaptive else CAMPAIGNS)
     judge = figures.Judge(plan.protocol.analysis, model)
-    return Request(store, plan, used, pilot, judge, count, seed, classifier, sessions)
+    return PowerRequest(store, plan, used, pilot, judge, count, seed, classifier, sessions)
 
 
 def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
@@ -232,7 +232,7 @@ def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
     return foretell(request(pilot, collected(pilot), plan, model, classifier=None))
 
 
-def foretell(asked: Request) -> PowerRecord:
+def foretell(asked: PowerRequest) -> PowerRecord:
     """Draw campaigns, and return their statistics of each claim.
 
     Raises:
@@ -244,7 +244,7 @@ def foretell(asked: Request) -> PowerRecord:
     found = drawn_campaigns(drawing, asked.drawn)
     curve, more = learning_curve(asked)
     plan, stopping = asked.plan, claims_of(asked.plan)
-    planned = len(Grid.of(plan).trials)
+    planned = len(TrialGrid.of(plan).trials)
     ended = tuple(it.ended for it in found)
     taken = [min(stopping.most or planned, planned) if n is None else n for n in ended]
     hours = plan.total_seconds / 3600.0
@@ -271,7 +271,7 @@ def foretell(asked: Request) -> PowerRecord:
     )
 
 
-def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
+def read_pilot(asked: PowerRequest) -> tuple[PilotFigures, list[str]]:
     """Return the figures of the pilot's trials, and what it does not determine.
 
     Raises:
@@ -305,7 +305,7 @@ def read_pilot(asked: Request) -> tuple[Pilot, list[str]]:
     blocks = [(item.name, trial.block) for item, trial, _ in asked.pilot]
     numbers = {block: number for number, block in enumerate(dict.fromkeys(blocks))}
     number = np.array([numbers[block] for block in blocks], np.int64)
-    return Pilot(axes, tuple(conditions), number, values, sessions_of(asked.pilot)), notes
+    return PilotFigures(axes, tuple(conditions), number, values, sessions_of(asked.pilot)), notes
 
 
 def sessions_of(pilot: Sequence[PilotTrial]) -> I64:
@@ -328,12 +328,12 @@ def sessions_of(pilot: Sequence[PilotTrial]) -> I64:
     return found
 
 
-def drawn_campaigns(drawing: Drawing, count: int) -> list[Drawn]:
+def drawn_campaigns(drawing: Drawing, count: int) -> list[CampaignDraw]:
     """Draw campaigns, on all cores if it takes long."""
-    found: dict[int, Drawn] = {}
+    found: dict[int, CampaignDraw] = {}
     with console.bar("drawn campaigns", count) as bar:
 
-        def keep(number: int, made: Drawn) -> None:
+        def keep(number: int, made: CampaignDraw) -> None:
             found[number] = made
             bar.advance()
 
@@ -347,7 +347,7 @@ def drawn_campaigns(drawing: Drawing, count: int) -> list[Drawn]:
     return [found[number] for number in range(count)]
 
 
-def learning_curve(asked: Request) -> tuple[Learning | None, list[str]]:
+def learning_curve(asked: PowerRequest) -> tuple[Learning | None, list[str]]:
     """Return the learning curve where a claim is about accuracy; else why there is none."""
     if asked.classifier is None or not any(
         claim.figure == "accuracy" for claim in claims_of(asked.plan).claims
@@ -365,7 +365,7 @@ def learning_curve(asked: Request) -> tuple[Learning | None, list[str]]:
         ]
     planned = sum(trial.split == "train" for trial in asked.plan)
     with timed(asked.store, "learning curve"):
-        labels = Labels(asked.store)
+        labels = StoreLabels(asked.store)
         train, validation, test = (load_samples(labels, asked.campaigns, split) for split in SPLITS)
         found = dict(_accuracies(asked, train, validation, test))
     orders = range(_orders(asked.classifier))
@@ -380,7 +380,7 @@ def _orders(classifier: Classifier) -> int:
 
 
 def _accuracies(
-    asked: Request, train: SampleSet, validation: SampleSet, test: SampleSet
+    asked: PowerRequest, train: SampleSet, validation: SampleSet, test: SampleSet
 ) -> Iterator[tuple[tuple[int, float], tuple[int, list[float]]]]:
     """Yield, by order and share, how many trials trained, and the accuracy on each test trial."""
     assert asked.classifier is not None

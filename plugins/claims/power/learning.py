@@ -16,7 +16,7 @@ from sliplab.analysis.metrics.window_groups import strict_hits
 from sliplab.analysis.networks.baselines import logistic_slices
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.plugins.claims.blocks import F64, I64
-from sliplab.plugins.claims.power.document import CurvePoint, Learning
+from sliplab.plugins.claims.power.document import Learning, LearningPoint
 from sliplab.protocols.hashing import hash_integer
 
 VERSION = 1
@@ -124,9 +124,9 @@ def learning_of(classifier: str, trials: F64, accuracy: F64, planned: int) -> Le
     )
 
 
-def _points(trials: F64, accuracy: F64, drawn: F64) -> tuple[CurvePoint, ...]:
+def _points(trials: F64, accuracy: F64, drawn: F64) -> tuple[LearningPoint, ...]:
     low, high = np.quantile(drawn, _TAILS, axis=0)
     return tuple(
-        CurvePoint(trials=round(n), accuracy=float(a), low=float(b), high=float(c))
+        LearningPoint(trials=round(n), accuracy=float(a), low=float(b), high=float(c))
         for n, a, b, c in zip(trials, accuracy, low, high, strict=True)
     )

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from sliplab.plugins.claims.blocks import F64, I64, block_share
-from sliplab.plugins.claims.evidence import Grid, planned_end
+from sliplab.plugins.claims.evidence import TrialGrid, planned_end
 from sliplab.plugins.claims.expectation import expectation
 from sliplab.protocols import Plan
 from sliplab.protocols.factors import Factor, Level
@@ -36,7 +36,7 @@ Condition = Mapping[str, Level]
 
 
 @dataclass(frozen=True)
-class Axis:
+class SharedFactor:
     """A factor that the pilot and the plan have.
 
     Attributes:
@@ -118,7 +118,7 @@ ONE_SESSION = Sessions()
 
 
 @dataclass(frozen=True)
-class Pilot:
+class PilotFigures:
     """Trials whose figures are known.
 
     Attributes:
@@ -129,7 +129,7 @@ class Pilot:
         sessions: (n,) number of each trial's session; None: all are of one.
     """
 
-    axes: tuple[Axis, ...]
+    axes: tuple[SharedFactor, ...]
     conditions: tuple[Condition, ...]
     blocks: I64
     values: dict[str, F64]
@@ -172,7 +172,7 @@ class Pilot:
             off, of = np.where(count > 0, total / np.maximum(count, 1), np.nan), of[first]
         return block_share(off, of, least=2)[1] / scatter if scatter > 0.0 else 0.0
 
-    def without(self, sessions: Sessions) -> Pilot:
+    def without(self, sessions: Sessions) -> PilotFigures:
         """Return the pilot without differences between its sessions, where these are drawn."""
         if self.sessions is None or sessions.count == 1 or sessions.between == 0.0:
             return self
@@ -185,7 +185,7 @@ class Pilot:
         return replace(self, values=values)
 
     def over_time(
-        self, plan: Plan, grid: Grid, sessions: Sessions, rng: np.random.Generator
+        self, plan: Plan, grid: TrialGrid, sessions: Sessions, rng: np.random.Generator
     ) -> dict[str, F64]:
         """Draw the effects of time on a campaign's trials, (N,) by figure, in the order taken.
 
@@ -211,7 +211,7 @@ class Pilot:
         return found
 
     def campaign(
-        self, grid: Grid, rng: np.random.Generator, *, in_blocks: bool = True
+        self, grid: TrialGrid, rng: np.random.Generator, *, in_blocks: bool = True
     ) -> dict[str, F64]:
         """Draw the figures of a campaign, (N,) by figure.
 
@@ -222,7 +222,7 @@ class Pilot:
         conditions = [dict(trial.condition) for trial in grid.trials]
         return self._again(rng)._drawn(conditions, blocks if in_blocks else None, rng)
 
-    def _again(self, rng: np.random.Generator) -> Pilot:
+    def _again(self, rng: np.random.Generator) -> PilotFigures:
         """Resample the pilot."""
         return replace(self, values=self._drawn(self.conditions, self.blocks, rng))
 
@@ -280,7 +280,7 @@ class Pilot:
         return np.hstack(code), np.hstack(places)
 
 
-def sessions_text(pilot: Pilot, sessions: Sessions) -> Iterator[str]:
+def sessions_text(pilot: PilotFigures, sessions: Sessions) -> Iterator[str]:
     """Yield which sessions and drift are drawn, and the limits of the pilot for them."""
     there, only = pilot.session_count, "a pilot of one session cannot show how sessions differ"
     sizes = ", ".join(f"{pilot.between(name, sessions):.2f} ({name})" for name in pilot.values)
@@ -317,7 +317,9 @@ def _smoothing(off: F64) -> tuple[float, float]:
     return float(shrunk), float(shrunk * width)
 
 
-def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis, ...], list[str]]:
+def shared_axes(
+    plan: Plan, conditions: Sequence[Condition]
+) -> tuple[tuple[SharedFactor, ...], list[str]]:
     """Return the factors that a pilot and a plan share, and the limits of the pilot for others.
 
     Args:
@@ -326,7 +328,7 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
     Raises:
         KeyedError: a level lies outside of the pilot's, or is compared by a claim and unknown.
     """
-    axes: list[Axis] = []
+    axes: list[SharedFactor] = []
     notes: list[str] = []
     collection, levels = plan.protocol.collection, plan.enabled
     claims = () if collection.stopping is None else collection.stopping.claims
@@ -350,13 +352,15 @@ def shared_axes(plan: Plan, conditions: Sequence[Condition]) -> tuple[tuple[Axis
             known = sorted(known, key=float)
         elif len(words) < len(known):
             raise KeyedError(f"collection.factors.{name}", known[0], "is words in one of both")
-        axis = Axis(name, tuple(known), turns=name in directions and not words)
+        axis = SharedFactor(name, tuple(known), turns=name in directions and not words)
         notes += _unknown(axis, factor, levels[name], name in compared)
         axes.append(axis)
     return tuple(axes), notes
 
 
-def _unknown(axis: Axis, factor: Factor, levels: Sequence[Level], compared: bool) -> Iterator[str]:
+def _unknown(
+    axis: SharedFactor, factor: Factor, levels: Sequence[Level], compared: bool
+) -> Iterator[str]:
     """Yield notes on levels that the pilot lacks.
 
     Raises:

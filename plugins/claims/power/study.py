@@ -10,7 +10,7 @@ import typer
 
 from sliplab.analysis.study import Finding, Study
 from sliplab.flows.cli.common import CampaignOption, EnableOption, ProtocolArgument
-from sliplab.plugins.claims.power.document import ClaimPower, Learning, PowerRecord, Spread
+from sliplab.plugins.claims.power.document import ClaimPower, Learning, PowerRecord, TrialSpread
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def shown(record: PowerRecord) -> Iterator[Table | str]:
 
 def view(record: PowerRecord) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import Figure, Table
+    from sliplab.analysis.report.page import PageFigure, Table
     from sliplab.plugins.claims.power import plot
 
     simulated, curve = record.simulated, record.learning
@@ -137,9 +137,9 @@ def view(record: PowerRecord) -> dict[str, object]:
     return {
         "texts": list(_texts(record)),
         "claims": Table(COLUMNS, _rows(record)),
-        "decisions": Figure(plot.decisions(calls, record.planned, simulated=simulated)),
-        "widths": Figure(plot.widths(record.claims, simulated=simulated)),
-        "learning": curve and Figure(plot.learning_curve(curve, simulated=simulated)),
+        "decisions": PageFigure(plot.decisions(calls, record.planned, simulated=simulated)),
+        "widths": PageFigure(plot.widths(record.claims, simulated=simulated)),
+        "learning": curve and PageFigure(plot.learning_curve(curve, simulated=simulated)),
     }
 
 
@@ -167,7 +167,7 @@ def _rows(record: PowerRecord) -> list[list[str]]:
     return [*found, [TOGETHER, *together]]
 
 
-def _trials(spread: Spread, record: PowerRecord) -> tuple[str, str]:
+def _trials(spread: TrialSpread, record: PowerRecord) -> tuple[str, str]:
     low, median, high = (
         f"> {record.planned}" if n is None else str(n)
         for n in (spread.low, spread.median, spread.high)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from sliplab.plugins.formats.ros.mcap import MAGIC, mcap_source
-from sliplab.plugins.formats.ros.recording import Source, recording
+from sliplab.plugins.formats.ros.recording import MessageSource, recording
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, read_head
@@ -75,7 +75,7 @@ def salvage_bag(path: Path, name: str) -> ForeignTrial:
     return replace(recording(path, name, _sqlite(path, whole=False)), lost=lost)
 
 
-def _file(path: Path) -> Source:
+def _file(path: Path) -> MessageSource:
     head = read_head(path)
     if head.startswith(SQLITE):
         return _sqlite(path)
@@ -88,7 +88,7 @@ def _file(path: Path) -> Source:
     raise FormatError("is neither a .bag nor an SQLite file of ROS 2", path)
 
 
-def _folder(path: Path) -> Source:
+def _folder(path: Path) -> MessageSource:
     """Join the files of a recording, in the order that its metadata give."""
     said = []
     try:
@@ -126,7 +126,7 @@ def _folder(path: Path) -> Source:
     ]
     ros1 = {topic for source in sources for topic in source.ros1}
     warnings = (*said, *missing, *(line for source in sources for line in source.warnings))
-    return Source(topics, read, ros1, warnings)
+    return MessageSource(topics, read, ros1, warnings)
 
 
 def _order(file: Path) -> tuple[int, str]:
@@ -135,12 +135,12 @@ def _order(file: Path) -> tuple[int, str]:
     return int(number[1]) if number else 0, file.name
 
 
-def _packed(path: Path) -> Source:
+def _packed(path: Path) -> MessageSource:
     """Return the messages of a file that the recorder compressed whole, as `.db3.zstd`."""
     import zstandard
 
     @contextmanager
-    def unpacked() -> Iterator[Source]:
+    def unpacked() -> Iterator[MessageSource]:
         with TemporaryDirectory() as folder:
             file = Path(folder) / path.stem
             try:
@@ -155,13 +155,13 @@ def _packed(path: Path) -> Source:
             yield from source.read(topic)
 
     with unpacked() as source:
-        return Source(source.topics, read, source.ros1, source.warnings)
+        return MessageSource(source.topics, read, source.ros1, source.warnings)
 
 
 # -- ROS 2's SQLite files ------------------------------------------------------------------
 
 
-def _sqlite(path: Path, *, whole: bool = True) -> Source:
+def _sqlite(path: Path, *, whole: bool = True) -> MessageSource:
     """Return the messages of a `.db3`, which are read in the order in which they were written.
 
     Args:
@@ -203,7 +203,7 @@ def _sqlite(path: Path, *, whole: bool = True) -> Source:
         for ending in ("-wal", "-journal")
         if _size(path.with_name(path.name + ending))
     ]
-    return Source(topics, read, warnings=tuple(warnings))
+    return MessageSource(topics, read, warnings=tuple(warnings))
 
 
 def _rows(database: sqlite3.Connection, topic: str, path: Path, whole: bool) -> Iterator[int]:
@@ -265,7 +265,7 @@ def _opened_sqlite(path: Path) -> Iterator[sqlite3.Connection]:
 # -- ROS 1 ---------------------------------------------------------------------------------
 
 
-def _bag(path: Path) -> Source:
+def _bag(path: Path) -> MessageSource:
     with _opened_bag(path) as reader:
         topics = {one.topic: one.msgtype for one in reader.connections}
 
@@ -284,7 +284,7 @@ def _bag(path: Path) -> Source:
                     fault = FormatError(f"is in a damaged chunk: {_text(error)}")
                     yield from [fault] * left
 
-    return Source(topics, read, set(topics))
+    return MessageSource(topics, read, set(topics))
 
 
 def _by_chunk(reader: Reader, wanted: set[int]) -> list[dict[int, list[Any]]]:

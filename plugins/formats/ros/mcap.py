@@ -33,7 +33,7 @@ from sliplab.plugins.formats.ros.mcap_writer import (
     write_mcap,
 )
 from sliplab.plugins.formats.ros.original import Original
-from sliplab.plugins.formats.ros.recording import FRAMES, Source, recording
+from sliplab.plugins.formats.ros.recording import FRAMES, MessageSource, recording
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.storage.errors import StoreError
@@ -88,13 +88,13 @@ class _Found:
     """Topic by the name of a camera, of a file of ours."""
     attached: dict[str, bytes] = field(default_factory=dict)
     about: dict[str, str] | None = None
-    columns: dict[tuple[str, str], list[ros2.Rows]] = field(default_factory=dict)
+    columns: dict[tuple[str, str], list[ros2.RowsMessage]] = field(default_factory=dict)
     library: str = ""
     """The program that wrote the file."""
 
 
 @dataclass
-class _Part:
+class _FileHead:
     """The beginning of a file: the records before the byte `end`, all by default.
 
     `at` is the byte of the record that is being read.
@@ -119,7 +119,7 @@ def read_mcap(path: Path, name: str) -> ForeignTrial:
     return recording(path, name, _source(path, found))
 
 
-def mcap_source(path: Path) -> Source:
+def mcap_source(path: Path) -> MessageSource:
     """Return the messages of a file as a recording by other programs has them.
 
     Raises:
@@ -136,7 +136,7 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
             which a file that is cut short has lost, and it is imported whole or not at all.
         ModuleNotFoundError: the extra `publish` is missing.
     """
-    found, part = _Found(), _Part()
+    found, part = _Found(), _FileHead()
     try:
         for _ in _messages(path, found, (), part=part):
             pass
@@ -151,7 +151,9 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
         )
     # topics after the damage are no longer readable
     found = _Found()
-    frames = Counter(topic for _, topic, _ in _messages(path, found, FRAMES, part=_Part(part.at)))
+    frames = Counter(
+        topic for _, topic, _ in _messages(path, found, FRAMES, part=_FileHead(part.at))
+    )
     trial = recording(path, name, _source(path, found, part.at))
     lost = Lost(at_byte=part.at, unread_bytes=path.stat().st_size - part.at, reason=reason)
     said = _messages_said(path, trial.about.get("frame_topic"))
@@ -208,7 +210,7 @@ def _scan(path: Path) -> _Found:
         kept += len(data)
         if kept > _MOST_KEPT:
             raise FormatError(f"holds more than {_MOST_KEPT >> 30} GiB in {topic}")
-        rows = ros2.Rows.parse(data)
+        rows = ros2.RowsMessage.parse(data)
         found.columns.setdefault((rows.file, rows.column), []).append(rows)
     return found
 
@@ -218,7 +220,7 @@ def _messages(
     found: _Found | None,
     kinds: Collection[str],
     topic: str | None = None,
-    part: _Part | None = None,
+    part: _FileHead | None = None,
 ) -> Iterator[tuple[str, str, bytes]]:
     """Yield messages of some types, and of one topic: type, topic and bytes, as the file has them.
 
@@ -264,7 +266,7 @@ def _messages(
         elif isinstance(record, Header) and found is not None:
             found.library = record.library
 
-    part = part or _Part()
+    part = part or _FileHead()
     try:
         with path.open("rb") as handle:
             within: Any = _Within(handle, path.stat().st_size)  # StreamReader calls read alone
@@ -412,7 +414,7 @@ def _campaign(path: Path, found: _Found) -> CampaignTexts:
     return CampaignTexts(info, *texts)
 
 
-def _column(parts: list[ros2.Rows]) -> npt.NDArray[np.generic]:
+def _column(parts: list[ros2.RowsMessage]) -> npt.NDArray[np.generic]:
     first = parts[0].values
     for part in parts:
         if part.values.dtype != first.dtype or part.values.shape[1:] != first.shape[1:]:
@@ -448,14 +450,14 @@ def _checked(chunk: EventChunk, packet: ros2.EventPacket) -> EventChunk:
     return event_chunk(chunk.x, chunk.y, chunk.p, chunk.t_us)
 
 
-def _source(path: Path, found: _Found, end: float = float("inf")) -> Source:
+def _source(path: Path, found: _Found, end: float = float("inf")) -> MessageSource:
     """Return the messages of a recording by other programs, read up to the byte `end`."""
 
     def read(topic: str) -> Iterator[bytes]:
-        for _, _, data in _messages(path, None, {found.topics[topic]}, topic, _Part(end)):
+        for _, _, data in _messages(path, None, {found.topics[topic]}, topic, _FileHead(end)):
             yield data
 
-    return Source(found.topics, read, frozenset(found.ros1))
+    return MessageSource(found.topics, read, frozenset(found.ros1))
 
 
 def _check_library(path: Path) -> None:

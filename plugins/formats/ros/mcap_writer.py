@@ -204,7 +204,7 @@ class _Trial:
                 for name, unit in _column_units(reader).items():
                     values = reader.column(name)
                     for low in range(0, len(values), _ROWS):
-                        rows = ros2.Rows(file, name, unit, values[low : low + _ROWS])
+                        rows = ros2.RowsMessage(file, name, unit, values[low : low + _ROWS])
                         yield channel, rows.message(t_ns)
 
     def _events(self, name: str) -> Iterator[Message]:

@@ -228,7 +228,7 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowsMessage:
     """A message of ours: rows of a column of one of the trial's files."""
 
     file: str
@@ -237,7 +237,7 @@ class Rows:
     values: npt.NDArray[np.generic]
 
     @staticmethod
-    def parse(message: bytes) -> Rows:
+    def parse(message: bytes) -> RowsMessage:
         """Read one. Raises FormatError where it is damaged."""
         fields = Fields(message)
         file, column, unit, kind = (fields.text() for _ in range(4))
@@ -249,7 +249,7 @@ class Rows:
         if row == 0 or len(data) % row:
             raise FormatError(f"holds {column!r:.40} in parts of rows")
         values = np.frombuffer(data, kind).reshape(-1, *shape)
-        return Rows(file, column, unit, values)
+        return RowsMessage(file, column, unit, values)
 
     def message(self, t_ns: int) -> bytes:
         """Return the message."""

@@ -21,7 +21,7 @@ from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.stored import check_arrays
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.schema.trial import Counts, Provenance, SyncResult, TrialRecord
+from sliplab.storage.schema.trial import Provenance, StreamCounts, SyncResult, TrialRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
@@ -106,7 +106,7 @@ class Original:
         return first.shape[1], first.shape[0]
 
     @uninterrupted
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> Counts:
+    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
         """Commit the trial with its label and clocks; as `Restorable`."""
         writer = campaign.begin(name, self.frame_px(), self.rate_hz)
         try:

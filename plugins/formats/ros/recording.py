@@ -32,7 +32,7 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True)
-class Source:
+class MessageSource:
     """Messages of a recording.
 
     Attributes:
@@ -68,7 +68,7 @@ class _Topic(Generic[D]):
     """A topic, and its messages that the last read left out."""
 
     name: str
-    source: Source
+    source: MessageSource
     make: Callable[[], D]
     total: int = 0
     bad: int = 0
@@ -122,7 +122,7 @@ def _plain(data: bytes | FormatError) -> bytes:
         raise FormatError(f"holds a compressed message that is damaged: {error}") from None
 
 
-def recording(path: Path, name: str, source: Source) -> ForeignTrial:
+def recording(path: Path, name: str, source: MessageSource) -> ForeignTrial:
     """Return the trial of a recording.
 
     Raises:
@@ -175,7 +175,7 @@ def recording(path: Path, name: str, source: Source) -> ForeignTrial:
 
 
 def _first(
-    source: Source, kinds: Collection[str], make: Callable[[str], D], unread: dict[str, str]
+    source: MessageSource, kinds: Collection[str], make: Callable[[str], D], unread: dict[str, str]
 ) -> _Topic[D] | None:
     """Return the first topic of some types that can be read, and note why others cannot."""
     found = None

@@ -76,7 +76,7 @@ class FakeRobotiq:
         self._silent = False
         self.sets: list[str] = []
         """The commands that were sent, for tests."""
-        self._server = _Server((LOOPBACK, 0), _handler_of(self))
+        self._server = _GripperServer((LOOPBACK, 0), _handler_of(self))
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.02,), name="fake gripper", daemon=True
         )
@@ -172,7 +172,7 @@ class FakeRobotiq:
         return round(protocol.COUNTS * (1.0 - opening / self._range.opening_mm[1]))
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class _GripperServer(socketserver.ThreadingTCPServer):
     """Serves connections in threads, and breaks them when it ends."""
 
     allow_reuse_address, daemon_threads, block_on_close = True, True, False
@@ -196,8 +196,8 @@ class _Server(socketserver.ThreadingTCPServer):
 def _handler_of(gripper: FakeRobotiq) -> type[socketserver.StreamRequestHandler]:
     """Return the handler of a gripper's connections."""
 
-    class Handler(socketserver.StreamRequestHandler):
-        server: _Server
+    class GripperHandler(socketserver.StreamRequestHandler):
+        server: _GripperServer
 
         def handle(self) -> None:
             self.server.open.add(self)
@@ -206,4 +206,4 @@ def _handler_of(gripper: FakeRobotiq) -> type[socketserver.StreamRequestHandler]
                     self.wfile.write(gripper.answer(line.decode("ascii", "replace")))
             self.server.open.discard(self)
 
-    return Handler
+    return GripperHandler

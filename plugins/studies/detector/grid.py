@@ -15,13 +15,13 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 CHANNELS = ("conv1_channels", "conv2_channels", "hidden")
 
 
 @dataclass(frozen=True, order=True)
-class Setting:
+class NetworkSetting:
     """Windows and size of a network.
 
     Attributes:
@@ -51,18 +51,18 @@ class Setting:
         own = {name: getattr(self, name) for name in ("length_ms", "step_ms", "pool_px")}
         return Windows.model_validate({**base.model_dump(), **own})
 
-    def network(self, base: Network) -> Network:
+    def network(self, base: NetworkSettings) -> NetworkSettings:
         """Return a protocol's network with this width: whole channels, at least one."""
         wide = {name: max(1, round(getattr(base, name) * self.width)) for name in CHANNELS}
-        return Network.model_validate({**base.model_dump(), **wide})
+        return NetworkSettings.model_validate({**base.model_dump(), **wide})
 
 
-PAPER = Setting()
+PAPER = NetworkSetting()
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Values of each factor; names as in `Setting`."""
+    """Values of each factor; names as in `NetworkSetting`."""
 
     length_ms: tuple[int, ...] = (5, 10, 20, 30, 40, 50)
     step_ms: tuple[int, ...] = (1, 2, 5)
@@ -70,7 +70,7 @@ class Axes:
     width: tuple[float, ...] = (0.5, 1.0, 2.0)
 
     @property
-    def default(self) -> list[Setting]:
+    def default(self) -> list[NetworkSetting]:
         """All lines through the paper's setting, and the small cross of length and pooling."""
         lines = (
             replace(PAPER, **{field.name: value})
@@ -85,26 +85,28 @@ class Axes:
         return _ordered([PAPER, *lines, *cross])
 
     @property
-    def full(self) -> list[Setting]:
+    def full(self) -> list[NetworkSetting]:
         """All combinations of the values."""
         axes = (self.length_ms, self.step_ms, self.pool_px, self.width)
-        return _ordered(Setting(*values) for values in itertools.product(*axes))
+        return _ordered(NetworkSetting(*values) for values in itertools.product(*axes))
 
 
-def _ordered(settings: Iterable[Setting]) -> list[Setting]:
+def _ordered(settings: Iterable[NetworkSetting]) -> list[NetworkSetting]:
     """Sort settings, the paper's first: an unfinished search has what others are compared with."""
     return sorted(set(settings), key=lambda setting: (setting != PAPER, setting))
 
 
 @dataclass(frozen=True)
-class Grid:
+class SettingGrid:
     """Settings that are tried, and the reason of each that is not, by its title."""
 
-    settings: list[Setting]
+    settings: list[NetworkSetting]
     left_out: dict[str, str]
 
 
-def make_grid(axes: Axes, windows: Windows, network: Network, full: bool = False) -> Grid:
+def make_grid(
+    axes: Axes, windows: Windows, network: NetworkSettings, full: bool = False
+) -> SettingGrid:
     """Return the settings that a network can be built for.
 
     A value that is impossible whatever it is combined with is wrong input; a combination that is
@@ -130,10 +132,10 @@ def make_grid(axes: Axes, windows: Windows, network: Network, full: bool = False
             )
         else:
             settings.append(setting)
-    return Grid(settings, left_out)
+    return SettingGrid(settings, left_out)
 
 
-def _requirement(name: str, value: Any, windows: Windows, network: Network) -> str | None:
+def _requirement(name: str, value: Any, windows: Windows, network: NetworkSettings) -> str | None:
     """Return the requirement that a value violates, as text; None for a valid one."""
     if name == "width":
         wide = {key: round(getattr(network, key) * value) for key in CHANNELS}

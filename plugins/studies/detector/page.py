@@ -6,20 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
+from sliplab.analysis.report.page import PageFigure, Table, number, percent, render_page
 from sliplab.plugins.studies.detector.rows import (
     FACTORS,
     LOOSE,
     MOST_MISSED,
     OBJECTIVES,
-    Row,
+    DetectorRow,
     mean,
     short_list,
 )
 from sliplab.plugins.studies.plot import (
-    Bar,
-    Panel,
-    Point,
+    AxisPair,
+    DetectorPoint,
+    FactorBar,
     factor_lines,
     front_panels,
 )
@@ -46,12 +46,12 @@ TERMINAL = ("", "network", "stride", "rule", "strict", "latency", "early", "miss
 _LATENCY, _OPERATIONS = "mean incipient latency (ms)", "synaptic operations/s (million)"
 _TIME = "computing time (ms a second, one thread)"
 PANELS = (
-    Panel("mean_ms", "strict", _LATENCY, "strict accuracy (%)"),
-    Panel("mean_ms", "false_early_either", _LATENCY, "false early trials (%)"),
-    Panel("synaptic_operations_per_s", "strict", _OPERATIONS, "strict accuracy (%)", True),
-    Panel("synaptic_operations_per_s", "mean_ms", _OPERATIONS, _LATENCY, True),
-    Panel("us_per_s", "p95_ms", _TIME, "95th percentile latency (ms)", True),
-    Panel("us_per_s", "lost_either", _TIME, "missed or late trials (%)", True),
+    AxisPair("mean_ms", "strict", _LATENCY, "strict accuracy (%)"),
+    AxisPair("mean_ms", "false_early_either", _LATENCY, "false early trials (%)"),
+    AxisPair("synaptic_operations_per_s", "strict", _OPERATIONS, "strict accuracy (%)", True),
+    AxisPair("synaptic_operations_per_s", "mean_ms", _OPERATIONS, _LATENCY, True),
+    AxisPair("us_per_s", "p95_ms", _TIME, "95th percentile latency (ms)", True),
+    AxisPair("us_per_s", "lost_either", _TIME, "missed or late trials (%)", True),
 )
 DRAWN = {
     **dict.fromkeys(("strict", "false_early_either", "lost_either"), 100.0),
@@ -96,12 +96,12 @@ def render(result: Result) -> str:
     return render_page(Path(__file__).with_name("page.html"), **values)
 
 
-def rows_of(result: Result) -> list[Row]:
+def rows_of(result: Result) -> list[DetectorRow]:
     """Return the rows of a result."""
-    return [Row.of_json(row) for row in result["rows"]]
+    return [DetectorRow.of_json(row) for row in result["rows"]]
 
 
-def _front(rows: Sequence[Row], *, leads: bool) -> Table:
+def _front(rows: Sequence[DetectorRow], *, leads: bool) -> Table:
     shown, columns = ordered_front(rows, MOST_ROWS), list(COLUMNS)
     table = [cells(row) for row in shown]
     if leads:
@@ -111,16 +111,16 @@ def _front(rows: Sequence[Row], *, leads: bool) -> Table:
     return Table(columns, table)
 
 
-def _points(rows: Sequence[Row], simulated: bool) -> Figure:
-    def values(row: Row) -> dict[str, float | None]:
+def _points(rows: Sequence[DetectorRow], simulated: bool) -> PageFigure:
+    def values(row: DetectorRow) -> dict[str, float | None]:
         found = {name: row.objective(name) for name in OBJECTIVES}
         return {k: None if v is None else DRAWN.get(k, 1.0) * v for k, v in found.items()}
 
-    points = [Point(values(row), row.front, row.paper) for row in rows]
-    return Figure(front_panels(points, PANELS, simulated=simulated))
+    points = [DetectorPoint(values(row), row.front, row.paper) for row in rows]
+    return PageFigure(front_panels(points, PANELS, simulated=simulated))
 
 
-Comparisons = Sequence[tuple[Row, Mapping[str, Any]]]
+Comparisons = Sequence[tuple[DetectorRow, Mapping[str, Any]]]
 """Rows on the lines through the paper's setting, as `comparisons` of `detector_rows` has them."""
 
 
@@ -129,17 +129,17 @@ def _level(item: Mapping[str, Any]) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
-    bars: dict[str, list[Bar]] = {}
+def _lines(comparisons: Comparisons, simulated: bool) -> PageFigure:
+    bars: dict[str, list[FactorBar]] = {}
     for row, item in comparisons:
         ranges = {
             "strict": seed_range(row.test["strict"], 100),
             "mean_ms": seed_range(row.test["mean_ms"], 1),
         }
-        bar = Bar(_level(item), item["paper"], ranges)
+        bar = FactorBar(_level(item), item["paper"], ranges)
         bars.setdefault(FACTORS[item["factor"]], []).append(bar)
     figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
-    return Figure(factor_lines(bars, figures, simulated=simulated))
+    return PageFigure(factor_lines(bars, figures, simulated=simulated))
 
 
 def _factors(comparisons: Comparisons) -> Table:
@@ -164,7 +164,7 @@ def _factors(comparisons: Comparisons) -> Table:
     return Table(columns, table)
 
 
-def _cross(rows: Sequence[Row]) -> Table:
+def _cross(rows: Sequence[DetectorRow]) -> Table:
     """Window length by pooling."""
     there = {
         (row.setting.length_ms, row.setting.pool_px): [
@@ -197,18 +197,18 @@ def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Table:
     return Table(["windows", *(f"margin {margin:g}" for margin in margins)], table)
 
 
-def distinct(rows: Sequence[Row]) -> list[Row]:
+def distinct(rows: Sequence[DetectorRow]) -> list[DetectorRow]:
     """Return each detector once: two rules may have chosen the same pair."""
-    found: dict[Any, Row] = {}
+    found: dict[Any, DetectorRow] = {}
     for row in rows:
         found.setdefault(row.detector, row)
     return list(found.values())
 
 
-def ordered_front(rows: Sequence[Row], most: int | None = None) -> list[Row]:
+def ordered_front(rows: Sequence[DetectorRow], most: int | None = None) -> list[DetectorRow]:
     """Return the paper's row, then the front by mean latency: at most so many of it."""
 
-    def late(row: Row) -> tuple[bool, float]:
+    def late(row: DetectorRow) -> tuple[bool, float]:
         value = row.objective("mean_ms")
         return value is None, value or 0
 
@@ -240,7 +240,7 @@ def short_table(result: Result) -> tuple[Sequence[str], list[list[str]]]:
     return TERMINAL, table
 
 
-def cells(row: Row) -> list[str]:
+def cells(row: DetectorRow) -> list[str]:
     """Return a row as text under `COLUMNS`."""
     setting, test, work = row.setting, row.test, row.work
     name = f"{setting.length_ms}/{setting.step_ms} ms, {setting.pool_px} px, ×{setting.width:g}"

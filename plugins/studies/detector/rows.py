@@ -26,7 +26,7 @@ from sliplab.analysis.detectors.rule_sweep import Trials, choose_pair, score, sw
 from sliplab.analysis.metrics.paired import paired_difference
 from sliplab.analysis.metrics.pareto import front
 from sliplab.analysis.sweeps.runner import Arrays
-from sliplab.plugins.studies.detector.grid import PAPER, Setting, counted_stride, strides
+from sliplab.plugins.studies.detector.grid import PAPER, NetworkSetting, counted_stride, strides
 from sliplab.plugins.studies.detector.search import (
     PRECISIONS,
     DetectorSearch,
@@ -87,7 +87,7 @@ Detections = tuple[npt.NDArray[np.int64], ...]
 
 
 @dataclass(frozen=True)
-class Row:
+class DetectorRow:
     """One detector.
 
     Attributes:
@@ -99,7 +99,7 @@ class Row:
         front, front_validation: it is on the Pareto front of test or of validation trials.
     """
 
-    setting: Setting
+    setting: NetworkSetting
     precision: str
     stride_ms: int
     rule: str
@@ -120,15 +120,17 @@ class Row:
         return {**data.pop("setting"), **data}
 
     @staticmethod
-    def of_json(data: Json) -> Row:
+    def of_json(data: Json) -> DetectorRow:
         """Return the row that `as_json` gave.
 
         Raises:
             KeyError: it lacks a value.
         """
-        setting = Setting(**{field.name: data[field.name] for field in fields(Setting)})
-        names = [field.name for field in fields(Row) if field.name != "setting"]
-        return Row(setting, **{name: data[name] for name in names})
+        setting = NetworkSetting(
+            **{field.name: data[field.name] for field in fields(NetworkSetting)}
+        )
+        names = [field.name for field in fields(DetectorRow) if field.name != "setting"]
+        return DetectorRow(setting, **{name: data[name] for name in names})
 
     def value(self, name: str) -> Any:
         """Return a setting of the detector by its name in `as_json`."""
@@ -199,14 +201,14 @@ def _true_onsets(part: Sequence[LabelledTrial]) -> Trials:
 
 def make_rows(
     search: DetectorSearch, advance: Callable[[], None] = lambda: None
-) -> tuple[list[Row], dict[str, str]]:
+) -> tuple[list[DetectorRow], dict[str, str]]:
     """Return the rows of all stored runs, and those left out, with the reason.
 
     Args:
         advance: called after each setting.
     """
     truth = _Truth(search)
-    rows: list[Row] = []
+    rows: list[DetectorRow] = []
     left_out: dict[str, str] = {}
     for setting in search.grid.settings:
         ours = [
@@ -234,8 +236,8 @@ def make_rows(
 
 
 def _rows(
-    truth: _Truth, setting: Setting, precision: str, there: Sequence[tuple[Json, Arrays]]
-) -> list[Row]:
+    truth: _Truth, setting: NetworkSetting, precision: str, there: Sequence[tuple[Json, Arrays]]
+) -> list[DetectorRow]:
     rows = []
     figures = [one for one, _ in there]
     for stride in strides(setting.length_ms, truth.finest_ms):
@@ -243,7 +245,7 @@ def _rows(
         for rule, pair in zip(RULES, truth.choose(each), strict=True):
             own = precision == PRECISIONS[0] and rule == RULES[0]
             rows.append(
-                Row(
+                DetectorRow(
                     setting,
                     precision,
                     stride,
@@ -287,7 +289,7 @@ def _work(measured: Sequence[Json], per_s: float) -> BySeed:
     }
 
 
-def _costs(rows: Sequence[Row], part: str) -> npt.NDArray[np.float64]:
+def _costs(rows: Sequence[DetectorRow], part: str) -> npt.NDArray[np.float64]:
     """Return the objectives, all to be minimised; missing ones are infinite."""
     values = [
         [
@@ -300,14 +302,14 @@ def _costs(rows: Sequence[Row], part: str) -> npt.NDArray[np.float64]:
     return np.where(np.isnan(costs), np.inf, costs)
 
 
-def short_list(rows: Sequence[Row]) -> list[tuple[float, Row]]:
+def short_list(rows: Sequence[DetectorRow]) -> list[tuple[float, DetectorRow]]:
     """Return for each of `BUDGETS` the quickest detector that keeps it, by validation trials alone.
 
     Quickest is the lowest mean latency; among equals the fewest synaptic operations a second. A
     budget that none keeps has no line.
     """
 
-    def within(row: Row, name: str, limit: float) -> bool:
+    def within(row: DetectorRow, name: str, limit: float) -> bool:
         value = row.objective(name, "validation")
         return value is not None and value <= limit
 
@@ -343,7 +345,7 @@ def pair_table(search: DetectorSearch) -> list[Json]:
     return rows
 
 
-def comparisons(rows: Sequence[Row]) -> list[Json]:
+def comparisons(rows: Sequence[DetectorRow]) -> list[Json]:
     """Return each line through the paper's setting, the paper's own value among them.
 
     Networks are compared with the pair that validation trials chose for each, at a stride of a
@@ -372,7 +374,7 @@ def comparisons(rows: Sequence[Row]) -> list[Json]:
     return found
 
 
-def _line(rows: Sequence[Row], factor: str) -> list[int]:
+def _line(rows: Sequence[DetectorRow], factor: str) -> list[int]:
     """Return the places of rows that differ in one factor alone, in the order of its values."""
     words = (*PRECISIONS, *RULES)
 
@@ -386,11 +388,11 @@ def _line(rows: Sequence[Row], factor: str) -> list[int]:
     )
 
 
-def _has_papers_value(row: Row, factor: str) -> bool:
+def _has_papers_value(row: DetectorRow, factor: str) -> bool:
     return row.rule == RULES[0] if factor == "rule" else _at_base(row, factor)
 
 
-def _at_base(row: Row, factor: str) -> bool:
+def _at_base(row: DetectorRow, factor: str) -> bool:
     """Return whether a factor has the value that the lines of the other factors go through."""
     base = {
         **asdict(PAPER),
@@ -401,7 +403,7 @@ def _at_base(row: Row, factor: str) -> bool:
     return bool(row.value(factor) == base[factor])
 
 
-def _differences(row: Row, start: Row) -> dict[str, Json]:
+def _differences(row: DetectorRow, start: DetectorRow) -> dict[str, Json]:
     """Return differences by figure, over the seeds that both have."""
     both = [seed for seed in row.seeds if seed in start.seeds]
     result = {}
@@ -414,12 +416,12 @@ def _differences(row: Row, start: Row) -> dict[str, Json]:
     return result
 
 
-def table(rows: Sequence[Row], simulated: bool) -> pd.DataFrame:
+def table(rows: Sequence[DetectorRow], simulated: bool) -> pd.DataFrame:
     """Return means over seeds, of two figures also the extremes; columns name their units."""
     return pd.DataFrame([_flat(row, simulated) for row in rows])
 
 
-def _flat(row: Row, simulated: bool) -> Json:
+def _flat(row: DetectorRow, simulated: bool) -> Json:
     found: Json = {
         name: row.value(name)
         for name in ("length_ms", "step_ms", "pool_px", "precision", "stride_ms", "rule")

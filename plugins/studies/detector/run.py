@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.flows.running import console
 from sliplab.plugins.studies.detector import page
 from sliplab.plugins.studies.detector.grid import Axes, make_grid
-from sliplab.plugins.studies.detector.rows import Row, plan, search_result, table
+from sliplab.plugins.studies.detector.rows import DetectorRow, plan, search_result, table
 from sliplab.plugins.studies.detector.search import STEP, DetectorSearch, SearchSize, search_trials
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json, write_text
@@ -42,7 +42,7 @@ def detector_search(
         InputError: a value that no network can have.
         StoreError: trials or labels are missing.
     """
-    trials = search_trials(Labels(store, reviewed), campaigns, size)
+    trials = search_trials(StoreLabels(store, reviewed), campaigns, size)
     grid = make_grid(axes, trials.settings.windows, trials.settings.network, full)
     return DetectorSearch(trials, grid, size, Derived.of(store, STEP))
 
@@ -104,7 +104,7 @@ def tradeoff_detector(
             )
     with console.bar("judge (settings)", len(settings)) as bar:
         result = search_result(search, full, store.simulated, bar.advance)
-    rows = [Row.of_json(row) for row in result["rows"]]
+    rows = [DetectorRow.of_json(row) for row in result["rows"]]
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / NUMBERS, result)
     text = table(rows, store.simulated).to_csv(index=False, lineterminator="\n")

@@ -29,7 +29,7 @@ from sliplab.analysis.detectors.latency import true_slip
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.quantised import common_net, quantise
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.analysis.sweeps.runner import Advance, Arrays, Sweep
@@ -37,10 +37,16 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.studies.detector.grid import Grid, Setting, counted_stride
+from sliplab.plugins.studies.detector.grid import NetworkSetting, SettingGrid, counted_stride
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import AnalysisSettings, Network, Samples, Training, Windows
+from sliplab.protocols.settings import (
+    AnalysisSettings,
+    NetworkSettings,
+    SampleSettings,
+    Training,
+    Windows,
+)
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.streams import Json
@@ -78,7 +84,7 @@ class SearchSize:
 
 
 class LabelSource(Protocol):
-    """Labels of a store, such as `sliplab.analysis.labels.reviewed.Labels`."""
+    """Labels of a store, such as `sliplab.analysis.labels.reviewed.StoreLabels`."""
 
     def fresh(self, item: Collected, recording: Recording) -> bool:
         """Return whether a trial has its label."""
@@ -129,7 +135,7 @@ class SearchTrials:
         """All whose windows are counted, in the order of their stored counts."""
         return [*self.validation, *self.test, *self.falling]
 
-    def samples(self, setting: Setting, part: list[LabelledTrial], most: int) -> SampleSet:
+    def samples(self, setting: NetworkSetting, part: list[LabelledTrial], most: int) -> SampleSet:
         """Return windows of trials by the 50/50/50 rule, as many of each trial as of any other.
 
         Args:
@@ -137,7 +143,7 @@ class SearchTrials:
         """
         windows = setting.windows(self.settings.windows)
         own = self.settings.windows.length_ms * self.settings.samples.per_class
-        per_class = Samples(per_class=max(1, round(own / setting.length_ms)))
+        per_class = SampleSettings(per_class=max(1, round(own / setting.length_ms)))
         parts = []
         for number, used in enumerate(part):
             share = most // len(part) + (number < most % len(part))
@@ -196,13 +202,13 @@ def search_trials(
 
 
 @dataclass(frozen=True)
-class Run:
+class SearchRun:
     """A setting and a seed, with the keys of the network and of the result."""
 
-    setting: Setting
+    setting: NetworkSetting
     seed: int
     windows: Windows
-    network: Network
+    network: NetworkSettings
     training: Training
     model_key: str
     key: str
@@ -218,7 +224,9 @@ class Run:
         return f"{self.setting.title}, seed {self.seed}"
 
 
-def make_run(trials: SearchTrials, size: SearchSize, setting: Setting, seed: int) -> Run:
+def make_run(
+    trials: SearchTrials, size: SearchSize, setting: NetworkSetting, seed: int
+) -> SearchRun:
     """Return a run, with its keys."""
 
     def inputs(*parts: list[LabelledTrial]) -> list[Any]:
@@ -239,7 +247,7 @@ def make_run(trials: SearchTrials, size: SearchSize, setting: Setting, seed: int
     )
     judged = inputs(trials.validation, trials.test, trials.falling)
     key = make_key(STEP, VERSION, [model_key, judged], size.stride_ms)
-    return Run(setting, seed, windows, network, how, model_key, key)
+    return SearchRun(setting, seed, windows, network, how, model_key, key)
 
 
 class DetectorSearch:
@@ -251,7 +259,7 @@ class DetectorSearch:
     """
 
     def __init__(
-        self, trials: SearchTrials, grid: Grid, size: SearchSize, derived: Derived
+        self, trials: SearchTrials, grid: SettingGrid, size: SearchSize, derived: Derived
     ) -> None:
         self.trials, self.grid, self.size, self.derived = trials, grid, size, derived
         self.runs = [
@@ -260,15 +268,15 @@ class DetectorSearch:
             for setting in grid.settings
         ]
         self.sweep = Sweep(self.runs, derived, self.measure, self.estimate)
-        self._seconds: dict[Setting, tuple[float, float]] = {}
+        self._seconds: dict[NetworkSetting, tuple[float, float]] = {}
         self._samples_of: Windows | None = None
         self._samples: dict[str, SampleSet] = {}
 
-    def read(self, run: Run) -> tuple[Json, Arrays]:
+    def read(self, run: SearchRun) -> tuple[Json, Arrays]:
         """Return a stored run's figures and its spike counts."""
         return self.derived.read(run.name), self.derived.arrays(run.name)
 
-    def model_path(self, run: Run) -> Path:
+    def model_path(self, run: SearchRun) -> Path:
         """Return the file of a run's trained network."""
         name = f"{run.setting.slug}_seed{run.seed}_{run.model_key[:12]}.pt"
         return self.derived.folder / name
@@ -279,7 +287,7 @@ class DetectorSearch:
         found = {run.title: self.derived.read(run.name)["warnings"] for run in there}
         return {title: warnings for title, warnings in found.items() if warnings}
 
-    def estimate(self, run: Run) -> dict[str, float]:
+    def estimate(self, run: SearchRun) -> dict[str, float]:
         """Return the seconds of a run by part, ``train`` and ``count``.
 
         As long as a stored run of the same setting took; without one, estimated from a few windows.
@@ -299,7 +307,7 @@ class DetectorSearch:
         train, count = self._seconds[run.setting]
         return {"train": 0.0 if self.model_path(run).exists() else train, "count": count}
 
-    def _probe(self, run: Run) -> tuple[float, float]:
+    def _probe(self, run: SearchRun) -> tuple[float, float]:
         trials, samples = self.trials, self.size.samples
         few = trials.train[:PROBE_TRIALS]
         began = time.perf_counter()
@@ -322,7 +330,7 @@ class DetectorSearch:
         # counting, and accuracies and operations of two precisions
         return train, len(PRECISIONS) * (len(spans) * cut + each * (windows + 2 * samples))
 
-    def fitted(self, run: Run, advance: Callable[[float, str], None]) -> Fitted:
+    def fitted(self, run: SearchRun, advance: Callable[[float, str], None]) -> Fitted:
         """Return a run's network: the stored one, or trained now, from its last checkpoint."""
         path = self.model_path(run)
         if path.exists():
@@ -353,7 +361,7 @@ class DetectorSearch:
         state.unlink(missing_ok=True)
         return fitted
 
-    def measure(self, run: Run, advance: Advance) -> tuple[Json, Arrays]:
+    def measure(self, run: SearchRun, advance: Advance) -> tuple[Json, Arrays]:
         """Train a run's network and count its spikes; return figures and counts."""
         fitted = self.fitted(run, partial(advance, "train"))
         began = time.perf_counter()
@@ -366,7 +374,7 @@ class DetectorSearch:
                 results[precision] = {"left out": net}
                 advance("count", 1 / len(PRECISIONS), "")
                 continue
-            engine = Engine(net, run.windows.cells)
+            engine = SpikeEngine(net, run.windows.cells)
             test, validation = self._part(run, "test"), self._part(run, "validation")
             results[precision] = _window_figures(net, engine, test, validation)
             counts, firsts = [], []
@@ -392,7 +400,7 @@ class DetectorSearch:
         }
         return figures, arrays
 
-    def _part(self, run: Run, part: str) -> SampleSet:
+    def _part(self, run: SearchRun, part: str) -> SampleSet:
         """Return the windows of a part, made once for all runs in a row with the same windows."""
         if self._samples_of != run.windows:
             self._samples_of, self._samples = run.windows, {}
@@ -404,7 +412,7 @@ class DetectorSearch:
         return self._samples[part]
 
     def _count(
-        self, recording: Recording, engine: Engine, windows: Windows
+        self, recording: Recording, engine: SpikeEngine, windows: Windows
     ) -> tuple[npt.NDArray[np.uint16], int]:
         """Return spike counts of a trial at the finest stride, and the end of the first window."""
         length_ns = windows.length_ms * 1_000_000
@@ -441,7 +449,7 @@ def trial_counts(
 
 
 def _window_figures(
-    net: nn.Sequential, engine: Engine, test: SampleSet, validation: SampleSet
+    net: nn.Sequential, engine: SpikeEngine, test: SampleSet, validation: SampleSet
 ) -> Json:
     """Return accuracy, work and time of windows."""
     found = metrics.accuracy(engine.counts(test.windows), test.y)
@@ -458,7 +466,7 @@ def _window_figures(
     }
 
 
-def measure_speed(engine: Engine, x: SparseWindows) -> tuple[float, float]:
+def measure_speed(engine: SpikeEngine, x: SparseWindows) -> tuple[float, float]:
     """Return microseconds a window in one thread: one at a time, and in a batch; medians.
 
     The processor's time of this thread, so that other programs do not count. Rounds of both

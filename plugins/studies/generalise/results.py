@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.networks.training import EpochRecord
-from sliplab.analysis.sweeps.runner import Arrays, ResultFile, Task
+from sliplab.analysis.sweeps.runner import Arrays, ResultFile, SweepTask
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import (
@@ -247,7 +247,7 @@ class Generalisation:
             return [pair for pair in known if pair[1] in wanted]
         return [pair for pair in known if every or pair[1] == self.levels(pair[0])[0]]
 
-    def without(self, factor: str, level: str, say: Callable[[str], None]) -> Task:
+    def without(self, factor: str, level: str, say: Callable[[str], None]) -> SweepTask:
         """Return the task that trains without a level and tests on it.
 
         Args:
@@ -263,7 +263,7 @@ class Generalisation:
 
         state = self.folder / f"{key[:16]}.state"
         work = partial(train_without, self.trials, factor, level, self.settings, state, on_epoch)
-        return Task(name, key, work)
+        return SweepTask(name, key, work)
 
     def key(self, name: str, inputs: Any) -> str:
         """Return the key of a result.
@@ -276,7 +276,7 @@ class Generalisation:
 
 def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, list[TrialRef]]:
     """Return the samples of all parts of the split, and their trials in the samples' order."""
-    labels = Labels(store)
+    labels = StoreLabels(store)
     parts = [load_samples(labels, campaigns, split) for split in SPLITS]
     joined = SampleSet.join(parts, campaigns[0].settings.windows)
     found = by_id([ref for split in SPLITS for ref in split_trials(campaigns, split)])

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.models import Model, choose_model, wanted_models
-from sliplab.analysis.sweeps.runner import Task, task_sweep
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_models
+from sliplab.analysis.sweeps.runner import SweepTask, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
 from sliplab.plugins.studies.document import NotTrained, UnseenScores
@@ -102,14 +102,14 @@ def measure_generalisation(
     return Generalised(store.simulated, made, results, work.results.path)
 
 
-def skin_task(work: Generalisation, model: Model, seed: int, trials: int) -> Task:
+def skin_task(work: Generalisation, model: ModelOnDisk, seed: int, trials: int) -> SweepTask:
     """Return the task that tests the store's network on another skin of the same design."""
     name = f"skin {seed}"
     key = work.key(name, [work.campaigns[0].info["rig_hash"], trials, model.key])
-    return Task(name, key, partial(_touch, work, model, seed, trials))
+    return SweepTask(name, key, partial(_touch, work, model, seed, trials))
 
 
-def _touch(work: Generalisation, model: Model, seed: int, trials: int) -> UnseenScores:
+def _touch(work: Generalisation, model: ModelOnDisk, seed: int, trials: int) -> UnseenScores:
     """Take some of the same trials on another skin, score them, and delete them."""
     item, folder = work.campaigns[0], work.folder / f"skin{seed}"
     taken = Store.create(folder / "store").campaign(item.name).committed()

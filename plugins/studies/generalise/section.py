@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from sliplab.analysis.report.figures.intervals import Share, shares
-from sliplab.analysis.report.page import Content, Figure, Table, percent
+from sliplab.analysis.report.figures.intervals import ShareInterval, shares
+from sliplab.analysis.report.page import Content, PageFigure, Table, percent
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.analysis.report.programs import CommandResult
 from sliplab.analysis.report.seeds import seed_words
@@ -24,7 +24,7 @@ class SkinSection(Content):
 
     template: ClassVar[Path] = Path(__file__).with_name("section.html")
     command: str
-    figure: Figure | None = None
+    figure: PageFigure | None = None
     table: Table | None = None
     seeds: str = ""
 
@@ -42,7 +42,7 @@ def skin_section(
     """
     if found is None:
         return SkinSection(command)
-    groups: dict[str, list[Share]] = {}
+    groups: dict[str, list[ShareInterval]] = {}
     rows = []
     results = RESULT.parse(GeneralisationResults, found).results.items()
     for name, row in sorted(results, key=lambda each: each[0].startswith("skin ")):
@@ -50,7 +50,7 @@ def skin_section(
             rows.append([name, row.why, "", "", "", ""])
             continue
         group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
-        item = Share(name, row.share, row.low, row.high)
+        item = ShareInterval(name, row.share, row.low, row.high)
         groups.setdefault(group, []).append(item)
         span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
         rows.append(
@@ -61,7 +61,7 @@ def skin_section(
         drawn = [item for of in groups.values() for item in of]
         line = None if strict is None else (strict, "this network, its own skin")
         svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
-        figure = Figure(svg, name="skins", data=share_data(drawn))
+        figure = PageFigure(svg, name="skins", data=share_data(drawn))
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     return SkinSection(command, figure, Table(columns, rows), seeds)
 

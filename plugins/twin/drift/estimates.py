@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from sliplab.plugins.twin.posterior import IDENTIFIED, Bank, Estimate, Fitted, fitted
+from sliplab.plugins.twin.posterior import IDENTIFIED, Bank, FittedBank, ParameterPosterior, fitted
 from sliplab.storage.streams import F64
 
 FEWEST = 3
@@ -23,7 +23,7 @@ FEWEST = 3
 
 
 @dataclass(frozen=True)
-class Line:
+class DriftLine:
     """A straight line through k fits.
 
     Attributes:
@@ -40,7 +40,7 @@ class Line:
     scatter: float
 
 
-def line_through(places: F64, values: F64, variances: F64) -> Line:
+def line_through(places: F64, values: F64, variances: F64) -> DriftLine:
     """Return the line through values with variances, all (k,), at increasing places.
 
     Raises:
@@ -68,7 +68,9 @@ def line_through(places: F64, values: F64, variances: F64) -> Line:
     slope, error = float(best[1]), float(np.sqrt(seen * inverse[1, 1]))
     reach = float(student.ppf(0.975, k - 2)) * error
     p = 2.0 * float(student.sf(abs(slope) / error, k - 2))
-    return Line(float(best[0]), slope, slope - reach, slope + reach, p, float(np.sqrt(scatter)))
+    return DriftLine(
+        float(best[0]), slope, slope - reach, slope + reach, p, float(np.sqrt(scatter))
+    )
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Drift:
     values: F64
     errors: F64
     identified: bool
-    line: Line
+    line: DriftLine
 
 
 def drifts(bank: Bank, observed: F64, places: F64) -> list[Drift]:
@@ -100,8 +102,8 @@ def drifts(bank: Bank, observed: F64, places: F64) -> list[Drift]:
     Raises:
         ValueError: fewer than `FEWEST` references, or too few worlds.
     """
-    fits: dict[bytes, Fitted] = {}
-    found: list[tuple[Estimate, ...]] = []
+    fits: dict[bytes, FittedBank] = {}
+    found: list[tuple[ParameterPosterior, ...]] = []
     for row in observed:
         usable = np.isfinite(row)
         if usable.tobytes() not in fits:

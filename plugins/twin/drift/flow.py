@@ -20,14 +20,14 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import orchestration
 from sliplab.plugins.twin.drift.document import FRICTION, DriftFit, ParameterDrift, ReferenceFit
 from sliplab.plugins.twin.drift.estimates import FEWEST, Drift, drifts
-from sliplab.plugins.twin.parameters import PARAMETERS, Parameter, value_of
+from sliplab.plugins.twin.parameters import PARAMETERS, SceneParameter, value_of
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.pilots import check_level, read_slide
 from sliplab.plugins.twin.statistics import of_names, statistics
 from sliplab.plugins.twin.worlds import (
+    DrawnWorld,
     Prior,
     Slides,
-    World,
     guess_of,
     other_rig,
     simulated,
@@ -71,23 +71,23 @@ class OneSpecimen(Prior):
     with_forces: bool
 
     @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
+    def parameters(self) -> tuple[SceneParameter, ...]:
         """Parameters that may change along a campaign, if they are switched on in the rig file."""
         left_out = MADE if self.with_forces else MADE | STIFFNESSES
         return tuple(
             it for it in PARAMETERS if it.key not in left_out and value_of(self.rig.scene, it) > 0.0
         )
 
-    def world(self, number: int, slides: Slides) -> World:
+    def world(self, number: int, slides: Slides) -> DrawnWorld:
         """Return a world: the same specimen, with another error of depth zero."""
         values, rng = self._drawn(number)
         zero_mm = float(rng.uniform(-self.zero_mm, self.zero_mm))
         rig = other_rig(self.rig, values, {}, zero_mm)
-        return World(rig, slides, int(rng.integers(2**31)), guess_of(self.rig, self.zero_mm))
+        return DrawnWorld(rig, slides, int(rng.integers(2**31)), guess_of(self.rig, self.zero_mm))
 
 
 @dataclass(frozen=True)
-class References:
+class ReferenceTrials:
     """Labelled reference trials of a campaign in the plan's order, and what they recorded."""
 
     trials: tuple[Trial, ...]
@@ -100,7 +100,7 @@ class References:
         return all(slide.forces is not None for slide in self.slides.values())
 
 
-def read_references(store: Store, item: Collected) -> References:
+def read_references(store: Store, item: Collected) -> ReferenceTrials:
     """Read the labelled reference trials of a campaign.
 
     Raises:
@@ -127,13 +127,13 @@ def read_references(store: Store, item: Collected) -> References:
             "trend takes "
             f"{FEWEST}; ask for more by collection.references in its protocol"
         )
-    return References(tuple(trials), slides, sums.hexdigest())
+    return ReferenceTrials(tuple(trials), slides, sums.hexdigest())
 
 
 def fit_drift(
     store: Store,
     item: Collected,
-    references: References,
+    references: ReferenceTrials,
     rig: RigFile,
     worlds: int,
     spread: float,
@@ -200,7 +200,7 @@ def calibrate_drift(
 
 
 def parameter_drift(
-    it: Parameter, found: Drift, trials: Sequence[Trial], together: int
+    it: SceneParameter, found: Drift, trials: Sequence[Trial], together: int
 ) -> ParameterDrift:
     """Return the stored result of a parameter's drift.
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.evaluation.trials import Judged, judge, summaries
+from sliplab.analysis.evaluation.trials import EvaluatedTrials, judge, summaries
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import (
-    Model,
+    ModelOnDisk,
     choose_model,
     rules_of,
     training_settings,
@@ -67,7 +67,7 @@ class Trained:
     simulated: bool
     rigs: int
     trials: int
-    model: Model
+    model: ModelOnDisk
 
 
 def request(
@@ -198,18 +198,20 @@ def simulated_network(name: TrainedOn, run_requests: list[RunRequest]) -> Traine
     return Trained(name, rig, True, len(run_requests), trials, model)
 
 
-def tested(wanted: Gap, model: Model) -> Judged:
+def tested(wanted: Gap, model: ModelOnDisk) -> EvaluatedTrials:
     """Test a network on the real test trials, by their protocols' own rules."""
     fitted = model_file.load(model.path)
     return judge(fitted, rules(wanted, model), wanted.store, wanted.tested)
 
 
-def rules(wanted: Gap, model: Model) -> dict[str, Detection]:
+def rules(wanted: Gap, model: ModelOnDisk) -> dict[str, Detection]:
     """Return the rule of each tested campaign, in spikes of a network."""
     return rules_of(wanted.tested, model.settings.network.outputs_per_class)
 
 
-def scores(wanted: Gap, network: Trained, judged: Judged, less: Behind | None) -> GapNetwork:
+def scores(
+    wanted: Gap, network: Trained, judged: EvaluatedTrials, less: Behind | None
+) -> GapNetwork:
     """Return the stored result of a network.
 
     Args:

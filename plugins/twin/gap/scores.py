@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.analysis.evaluation.trials import Judged
+from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.analysis.metrics.intervals import share_difference
 from sliplab.plugins.twin.document import Behind
 from sliplab.storage.schema.evaluation import Classification
@@ -24,7 +24,7 @@ def macro_f1(found: Classification) -> float | None:
     return float(np.mean(scores))
 
 
-def behind(first: Judged, other: Judged) -> Behind:
+def behind(first: EvaluatedTrials, other: EvaluatedTrials) -> Behind:
     """Return the strict accuracy of the first network less that of the other.
 
     Both were judged on the same trials, of which the interval takes the differences.

@@ -65,16 +65,18 @@ def shown(found: TwinGap) -> Iterator[Table]:
 
 def view(found: TwinGap) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.figures.intervals import Share, shares
-    from sliplab.analysis.report.page import Figure, Table
+    from sliplab.analysis.report.figures.intervals import ShareInterval, shares
+    from sliplab.analysis.report.page import PageFigure, Table
 
     strict = [(it.title, it.windows.strict) for it in found.networks]
-    rows = {"network trained on": [Share(title, s.share, s.low, s.high) for title, s in strict]}
+    rows = {
+        "network trained on": [ShareInterval(title, s.share, s.low, s.high) for title, s in strict]
+    }
     label = "strict accuracy on the test trials (%)"
     table = [_cells(it) for it in found.networks]
     return {
         "campaigns": " and ".join(found.campaigns),
-        "accuracy": Figure(shares(rows, label, simulated=found.simulated)),
+        "accuracy": PageFigure(shares(rows, label, simulated=found.simulated)),
         "networks": Table(COLUMNS[:LATENCIES], [row[:LATENCIES] for row in table]),
         "latencies": Table(
             ("trained on", *COLUMNS[LATENCIES:]), [[row[0], *row[LATENCIES:]] for row in table]

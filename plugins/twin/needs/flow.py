@@ -28,7 +28,7 @@ from sliplab.plugins.twin.needs.judging import (
     need,
 )
 from sliplab.plugins.twin.pilot import PilotTrial
-from sliplab.plugins.twin.worlds import World, everywhere
+from sliplab.plugins.twin.worlds import DrawnWorld, everywhere
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
 from sliplab.storage.streams import F64, Json
@@ -65,7 +65,7 @@ class _Judged:
     """
 
     pilot: Marked
-    worlds: Sequence[World]
+    worlds: Sequence[DrawnWorld]
     having: Marked
 
     def without(self, effects: Sequence[Effect], beside: Json) -> list[Need]:
@@ -103,12 +103,12 @@ class _Judged:
         return [min(times) for times in zip(*rounds, strict=True)]
 
 
-def _numbers(world: World, kept: frozenset[str]) -> F64:
+def _numbers(world: DrawnWorld, kept: frozenset[str]) -> F64:
     return marked([[marks(trial) for trial in world.take()]], kept).values
 
 
 def measure_needs(
-    pilot: Sequence[PilotTrial], worlds: Sequence[World], taken: Sequence[Sequence[Marks]]
+    pilot: Sequence[PilotTrial], worlds: Sequence[DrawnWorld], taken: Sequence[Sequence[Marks]]
 ) -> Needs:
     """Measure which effects a pilot's test trials ask for; nothing with too few of them.
 

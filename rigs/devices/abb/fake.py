@@ -65,7 +65,7 @@ class Wait:
 
 
 @dataclass(frozen=True)
-class Program:
+class MotionProgram:
     """A motion program without EGM commands."""
 
     tool: Pose
@@ -101,7 +101,7 @@ class _Reader:
         return from_quaternion(values[:3], values[3:])
 
 
-def read_program(data: bytes) -> Program:
+def read_program(data: bytes) -> MotionProgram:
     """Parse a motion program file. Raises ProgramError."""
     reader = _Reader(data)
     if reader.number() != FILE_VERSION:
@@ -129,7 +129,7 @@ def read_program(data: bytes) -> Program:
             commands.append(Wait(reader.number()))
         else:
             raise ProgramError(f"the command {operation:g} is not simulated")
-    return Program(tool, mass_kg, tuple(commands))
+    return MotionProgram(tool, mass_kg, tuple(commands))
 
 
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)

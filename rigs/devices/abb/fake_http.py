@@ -39,7 +39,7 @@ class HttpServer:
     """An HTTP server; clients without an answer wait until it is closed."""
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:
-        self._server = _Server((host, port), _Handler)
+        self._server = _RobotServer((host, port), _Handler)
         self._server.answer = answer
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.02,), daemon=True
@@ -64,7 +64,7 @@ class HttpServer:
         self._thread.join(_END_S)
 
 
-class _Server(ThreadingHTTPServer):
+class _RobotServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
@@ -97,7 +97,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    server: _Server
+    server: _RobotServer
     timeout = 30
     _session = ""
 

@@ -45,7 +45,7 @@ _WRAP, _HALF = 1 << 32, 1 << 31
 
 
 @dataclass
-class Counts:
+class RecordCounts:
     """Records of one stream, and what became of others."""
 
     received: int = 0
@@ -82,7 +82,7 @@ class AtiNetFt:
         self._ending = threading.Event()
         self._lock = threading.Lock()
         self._waiting: deque[tuple[bytes, int]] = deque(maxlen=BACKLOG)
-        self._page: rdt.Page | None = None
+        self._page: rdt.ConfigurationPage | None = None
         self._scale = (1.0, 1.0)
         self._fault: str | None = None
         self._ticks: int | None = None
@@ -92,7 +92,7 @@ class AtiNetFt:
 
     def _forget(self) -> None:
         """Begin a stream: nothing is known of its records."""
-        self.counts, self._fault = Counts(), None
+        self.counts, self._fault = RecordCounts(), None
         self._number = self._ticks = None
         self._missing: deque[int] = deque(maxlen=MISSING)
         self._passed = self._rejected = 0
@@ -221,7 +221,7 @@ class AtiNetFt:
 
     # -- the web page ----------------------------------------------------------------------
 
-    def _configure(self) -> rdt.Page:
+    def _configure(self) -> rdt.ConfigurationPage:
         """Write rate and filter, and read the page, which must show the written values."""
         settings = self._settings
         if settings.rate_hz is not None:
@@ -242,10 +242,10 @@ class AtiNetFt:
                 )
         return page
 
-    def _read_page(self) -> rdt.Page:
+    def _read_page(self) -> rdt.ConfigurationPage:
         text = self._get(rdt.PAGE)
         try:
-            return rdt.Page.parse(text)
+            return rdt.ConfigurationPage.parse(text)
         except ValueError as error:
             raise RigError(
                 DEVICE, f"http://{self._settings.host}:{self._settings.web_port}/{rdt.PAGE} {error}"

@@ -29,7 +29,7 @@ Load = Callable[[int], Sequence[float]]
 """From the clock's time, ns, to Fx Fy Fz (N) and Tx Ty Tz (N m)."""
 
 
-class Kind(Enum):
+class SensorFaultKind(Enum):
     """A kind of fault."""
 
     SILENCE = "silence"
@@ -84,7 +84,7 @@ class FakeNetFt:
         self._overloaded = False
         self._origin_ns = now_ns()
         self._bias = np.zeros(6)
-        self._left: dict[Kind, int] = {}
+        self._left: dict[SensorFaultKind, int] = {}
         self._held: bytes | None = None
         self._to: tuple[str, int] | None = None
         self._number = self._most = 0
@@ -150,17 +150,17 @@ class FakeNetFt:
 
     def silence(self) -> None:
         """Send nothing from now on."""
-        self.inject(Kind.SILENCE)
+        self.inject(SensorFaultKind.SILENCE)
 
     @property
     def streaming(self) -> bool:
         """True while records are sent."""
         return self._to is not None
 
-    def inject(self, kind: Kind, count: int = 1) -> None:
+    def inject(self, kind: SensorFaultKind, count: int = 1) -> None:
         """Inject a fault now."""
         with self._lock:
-            if kind is Kind.RESTART:
+            if kind is SensorFaultKind.RESTART:
                 self._origin_ns, self._first_ticks = self._now_ns(), 0
             else:
                 self._left[kind] = count
@@ -243,14 +243,14 @@ class FakeNetFt:
             if self._most and self._number == self._most:
                 self._to = None
 
-    def _happens(self, kind: Kind) -> bool:
+    def _happens(self, kind: SensorFaultKind) -> bool:
         left = self._left.get(kind, 0)
         if left:
             self._left[kind] = left - 1
         return left > 0
 
     def _send(self, ticks: int, felt: Sequence[float] | F64) -> None:
-        if self._left.get(Kind.SILENCE):
+        if self._left.get(SensorFaultKind.SILENCE):
             return
         record = np.zeros(1, rdt.RECORD)
         record["rdt"], record["ft"] = self._number % 2**32, ticks % 2**32
@@ -259,19 +259,19 @@ class FakeNetFt:
         torque = rdt.NEWTON_METRES.get(self._units[1], 1.0)
         record["force"] = np.rint(load[:3] / force * COUNTS_PER_N)
         record["torque"] = np.rint(load[3:] / torque * COUNTS_PER_NM)
-        if self._overloaded or self._happens(Kind.SATURATED):
+        if self._overloaded or self._happens(SensorFaultKind.SATURATED):
             record["status"] = OUT_OF_RANGE
         data = record.tobytes()
-        if self._happens(Kind.LOSS):
+        if self._happens(SensorFaultKind.LOSS):
             return
-        if self._held is None and self._happens(Kind.REORDER):
+        if self._held is None and self._happens(SensorFaultKind.REORDER):
             self._held = data
             return
         sent = [data] if self._held is None else [data, self._held]
         self._held = None
-        if self._happens(Kind.DUPLICATE):
+        if self._happens(SensorFaultKind.DUPLICATE):
             sent.append(data)
-        if self._happens(Kind.MALFORMED):
+        if self._happens(SensorFaultKind.MALFORMED):
             sent = [data[:20]]
         for one in sent:
             assert self._to is not None
@@ -281,7 +281,7 @@ class FakeNetFt:
 def _page_of(sensor: FakeNetFt) -> type[http.server.BaseHTTPRequestHandler]:
     """Return the handler of a sensor's page."""
 
-    class Handler(http.server.BaseHTTPRequestHandler):
+    class SensorHandler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             written = self.path.startswith(("/comm.cgi", "/setting.cgi"))
             if written:
@@ -296,4 +296,4 @@ def _page_of(sensor: FakeNetFt) -> type[http.server.BaseHTTPRequestHandler]:
         def log_message(self, format: str, *arguments: object) -> None:
             """Suppress log messages."""
 
-    return Handler
+    return SensorHandler

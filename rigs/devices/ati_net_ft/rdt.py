@@ -78,7 +78,7 @@ def records(data: bytes) -> npt.NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class Page:
+class ConfigurationPage:
     """The configuration page of a sensor."""
 
     counts_per_n: float
@@ -90,7 +90,7 @@ class Page:
     firmware: str
 
     @staticmethod
-    def parse(text: bytes) -> Page:
+    def parse(text: bytes) -> ConfigurationPage:
         """Read a page.
 
         Raises:
@@ -107,7 +107,7 @@ class Page:
         }
         if found.get("comrdte", "1").lower() in {"0", "disabled"}:
             raise ValueError("says that RDT is switched off; switch it on there")
-        return Page(
+        return ConfigurationPage(
             _calibration(found, "cfgcpf", "scfgfu", NEWTONS),
             _calibration(found, "cfgcpt", "scfgtu", NEWTON_METRES),
             _whole(found.get("comrdtrate")),

@@ -19,7 +19,7 @@ from sliplab.rigs.devices.basler.fake import EMULATED, emulate
 from sliplab.storage.streams import U8, FrameChunk
 
 
-class Setting:
+class CameraFeature:
     """A setting and its simulated values.
 
     Args:
@@ -107,7 +107,7 @@ class Setting:
 class Selected:
     """A switch for each choice of a selector, initially off."""
 
-    def __init__(self, selector: Setting) -> None:
+    def __init__(self, selector: CameraFeature) -> None:
         self._selector, self._on = selector, set[Any]()
 
     @property
@@ -129,7 +129,7 @@ class Selected:
         return self._selector.GetAccessMode()
 
 
-class Command:
+class CameraCommand:
     """A command that calls a function, and then the emulation's command if it has one."""
 
     def __init__(self, work: Callable[[], None], node: Any = None) -> None:
@@ -205,7 +205,7 @@ _Frame = tuple[U8, int, int, int]
 """Image, number, middle of the exposure in ns, and level of the sync line."""
 
 
-class Scene(Protocol):
+class FrameSource(Protocol):
     """The source of the frames."""
 
     on_frames: Callable[[FrameChunk], None]
@@ -234,7 +234,7 @@ class LiveBasler:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: FrameSource,
         mid_exposure_ns: int,
         sync_line: int,
         stored: Mapping[str, Any] | None = None,
@@ -313,7 +313,7 @@ class LiveBasler:
         if unknown := set(self._stored) - set(plain):
             raise ValueError(f"the fake has no {', '.join(sorted(unknown))} to store")
         own: dict[str, Any] = {
-            name: Setting(
+            name: CameraFeature(
                 name,
                 factory,
                 choices,
@@ -323,16 +323,18 @@ class LiveBasler:
             for name, (factory, choices) in plain.items()
         }
         own["ChunkEnable"] = Selected(own["ChunkSelector"])
-        own["UserSetLoad"] = Command(self._load_user_set)
+        own["UserSetLoad"] = CameraCommand(self._load_user_set)
         # frames exposed by then must still reach pylon
-        own["AcquisitionStop"] = Command(self._end_frames, emulated.GetNode("AcquisitionStop"))
+        own["AcquisitionStop"] = CameraCommand(
+            self._end_frames, emulated.GetNode("AcquisitionStop")
+        )
         own["BslResultingAcquisitionFrameRate"] = ReadOnly(lambda: min(MOST_HZ, 1e6 / exposure_us))
         return own
 
     def _load_user_set(self) -> None:
         chosen = self._nodes["UserSetSelector"].Value
         for name, node in self._nodes.items():
-            if isinstance(node, Setting) and name != "UserSetSelector":
+            if isinstance(node, CameraFeature) and name != "UserSetSelector":
                 node.load(stored=chosen != "Default")
 
     def _chunks(self) -> frozenset[str]:
@@ -354,7 +356,7 @@ class LiveBasler:
 
         nodes = self._device.GetNodeMap()
         for own in self._nodes.values():
-            if isinstance(own, Setting) and not own.simulated:
+            if isinstance(own, CameraFeature) and not own.simulated:
                 raise genicam.InvalidArgumentException(own.refusal(own.Value))
         for choice in nodes.GetNode("TriggerSelector").Symbolics:
             nodes.GetNode("TriggerSelector").Value = choice

@@ -39,7 +39,7 @@ class Abilities:
 
 
 @dataclass(frozen=True)
-class Stamping:
+class FrameStamping:
     """The chosen source of time stamps, and the resulting grade of `protocols.timing`."""
 
     means: Means
@@ -52,7 +52,7 @@ class Stamping:
         return stamp_ns if self.means == "host arrival" else stamp_ns + mid_exposure_ns
 
 
-def choose(has: Abilities, trigger: FrameTrigger) -> Stamping:
+def choose(has: Abilities, trigger: FrameTrigger) -> FrameStamping:
     """Choose the best source of time stamps of a camera.
 
     Stamps of a clock that cannot be related to the sync box's are no better than arrival times, so
@@ -66,11 +66,11 @@ def choose(has: Abilities, trigger: FrameTrigger) -> Stamping:
     elif has.event:
         means = "exposure end event"
     if means == "host arrival":
-        return Stamping(means, "host arrival")
+        return FrameStamping(means, "host arrival")
     if trigger == "hardware" and has.sync_level:
-        return Stamping(means, "hardware trigger")
+        return FrameStamping(means, "hardware trigger")
     if has.exposure_line:
-        return Stamping(means, "exposure line")
+        return FrameStamping(means, "exposure line")
     if has.latch:
-        return Stamping(means, "device time stamps")
-    return Stamping("host arrival", "host arrival")
+        return FrameStamping(means, "device time stamps")
+    return FrameStamping("host arrival", "host arrival")

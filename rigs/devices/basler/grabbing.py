@@ -17,7 +17,7 @@ from typing import Any
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.host_clock import StallTimer
-from sliplab.rigs.devices.basler.frame_time import Stamping
+from sliplab.rigs.devices.basler.frame_time import FrameStamping
 from sliplab.rigs.devices.basler.nodes import DEVICE
 from sliplab.storage.streams import U8
 
@@ -106,7 +106,7 @@ class GrabSettings:
         stall_ns: timeout for each later frame; 0 for none.
     """
 
-    stamping: Stamping
+    stamping: FrameStamping
     mid_exposure_ns: int
     first_id: int
     period_ns: int

@@ -20,7 +20,7 @@ from sliplab.rigs.core.capabilities import DeviceHealth, RigError
 from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.devices.dvxplorer.process import EventProcess
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.dvxplorer.source import DEVICE, Batch
+from sliplab.rigs.devices.dvxplorer.source import DEVICE, EventBatch
 from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
@@ -63,7 +63,7 @@ class EventCounts:
     before: int = 0
 
 
-class Source(Protocol):
+class OpenedInputs(Protocol):
     """Opened inputs: an `EventSource`, or an `EventProcess` that has one."""
 
     name: str
@@ -73,7 +73,7 @@ class Source(Protocol):
     def run(self, on: bool, noise_filter_us: int | None = None) -> None:
         """Switch events and triggers. Raises RigError."""
 
-    def poll(self) -> Batch:
+    def poll(self) -> EventBatch:
         """Read all available data."""
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
@@ -93,9 +93,9 @@ class DvxplorerCamera:
         RigError: no such camera or stream, or one that does not send events and triggers.
     """
 
-    def __init__(self, settings: DvxplorerSettings, source: Source | None = None) -> None:
+    def __init__(self, settings: DvxplorerSettings, source: OpenedInputs | None = None) -> None:
         self.settings = settings
-        self._source: Source = source if source is not None else EventProcess(settings)
+        self._source: OpenedInputs = source if source is not None else EventProcess(settings)
         self.width, self.height = self._source.resolution
         self._lock = threading.Lock()
         self._wanted = self._keep = False
@@ -311,7 +311,7 @@ class DvxplorerCamera:
         counts.longest_gap_us = max(counts.longest_gap_us, int(steps.max()))
         return True
 
-    def _take_triggers(self, batch: Batch) -> bool:
+    def _take_triggers(self, batch: EventBatch) -> bool:
         """Keep pulses; return whether there is a new one."""
         if not self._keep:
             return True

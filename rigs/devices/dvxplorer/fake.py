@@ -52,7 +52,7 @@ class Sent:
     seconds: float
 
 
-class ServerError(RuntimeError):
+class FakeServerError(RuntimeError):
     """The serving process failed or timed out."""
 
 
@@ -85,7 +85,7 @@ class DvxplorerServer:
         theirs.close()
         try:
             self.events_port, self.triggers_port = self._expect("ready", READY_S)
-        except ServerError:
+        except FakeServerError:
             self.close()
             raise
 
@@ -133,12 +133,14 @@ class DvxplorerServer:
     def _expect(self, wanted: str, timeout_s: float) -> Any:
         try:
             if not self._pipe.poll(timeout_s):
-                raise ServerError(f"the server did not report '{wanted}' within {timeout_s:g} s")
+                raise FakeServerError(
+                    f"the server did not report '{wanted}' within {timeout_s:g} s"
+                )
             said, value = self._pipe.recv()
         except (EOFError, OSError):
-            raise ServerError(f"the server ended before it reported '{wanted}'") from None
+            raise FakeServerError(f"the server ended before it reported '{wanted}'") from None
         if said != wanted:
-            raise ServerError(f"the server reported '{said}' instead of '{wanted}': {value}")
+            raise FakeServerError(f"the server reported '{said}' instead of '{wanted}': {value}")
         return value
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from sliplab.rigs.core.capabilities import DeviceHealth
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.dvxplorer.source import DEVICE, Batch, open_source
+from sliplab.rigs.devices.dvxplorer.source import DEVICE, EventBatch, open_source
 from sliplab.storage.streams import Json
 
 OPEN_S = 20.0
@@ -66,9 +66,9 @@ class EventProcess:
         """Switch a camera's events and its trigger input on or off. Raises RigError."""
         self._call("run", on, noise_filter_us)
 
-    def poll(self) -> Batch:
+    def poll(self) -> EventBatch:
         """Read all available data. Raises RigError if the library failed, died or hangs."""
-        found: Batch = self._call("poll")
+        found: EventBatch = self._call("poll")
         return found
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:

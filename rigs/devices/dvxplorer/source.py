@@ -44,7 +44,7 @@ class Input(Protocol):
 
 
 @dataclass(frozen=True)
-class Batch:
+class EventBatch:
     """The data that one read of an input returned.
 
     Attributes:
@@ -67,7 +67,7 @@ class Batch:
         return self.events is None and not len(self.trigger_us)
 
 
-class EventSource:
+class DvxEventSource:
     """Opened inputs, in the process that opened them.
 
     Args:
@@ -111,7 +111,7 @@ class EventSource:
         except RuntimeError as error:
             raise RigError(DEVICE, f"cannot be switched on or off: {short(error)}") from None
 
-    def poll(self) -> Batch:
+    def poll(self) -> EventBatch:
         """Read all available data at once. Raises any exception of the library."""
         batch, triggers = self._events.getNextEventBatch(), self._triggers.getNextTriggerBatch()
         events, filtered = None, 0
@@ -129,7 +129,7 @@ class EventSource:
                 np.ascontiguousarray(rows["timestamp"], np.int64),
             )
         rows_of = [] if triggers is None else list(triggers)
-        return Batch(
+        return EventBatch(
             events,
             filtered,
             np.array([int(trigger.timestamp) for trigger in rows_of], np.int64),
@@ -185,7 +185,7 @@ class EventSource:
         )
 
 
-def open_source(settings: UsbCamera | NetworkStream) -> EventSource:
+def open_source(settings: UsbCamera | NetworkStream) -> DvxEventSource:
     """Open the source in the settings, in this process; the library may hang or terminate it.
 
     Raises:
@@ -221,7 +221,7 @@ def find_camera(serial: str | None) -> Any:
     )
 
 
-def _open_camera(settings: UsbCamera) -> EventSource:
+def _open_camera(settings: UsbCamera) -> DvxEventSource:
     import dv_processing as dv
 
     there = find_camera(settings.serial)
@@ -238,7 +238,7 @@ def _open_camera(settings: UsbCamera) -> EventSource:
     found = in_force(camera)
     check_taken(found, settings)
     width, height = camera.getEventResolution()
-    return EventSource(camera, camera, camera, (width, height), camera.getCameraName(), found)
+    return DvxEventSource(camera, camera, camera, (width, height), camera.getCameraName(), found)
 
 
 def configure(camera: Any, settings: UsbCamera) -> None:
@@ -345,7 +345,7 @@ def check_taken(found: Json, settings: UsbCamera) -> None:
             )
 
 
-def _open_streams(settings: NetworkStream) -> EventSource:
+def _open_streams(settings: NetworkStream) -> DvxEventSource:
     import dv_processing as dv
 
     inputs = []
@@ -362,7 +362,7 @@ def _open_streams(settings: NetworkStream) -> EventSource:
     if not triggers.isTriggerStreamAvailable():
         raise RigError(DEVICE, f"{settings.host}:{settings.triggers_port} sends no triggers")
     width, height = resolution
-    return EventSource(events, triggers, None, (width, height), events.getCameraName())
+    return DvxEventSource(events, triggers, None, (width, height), events.getCameraName())
 
 
 def check_header(host: str, port: int) -> None:

@@ -29,7 +29,7 @@ _MOST_MISSED = 10_000
 
 
 @dataclass
-class Losses:
+class BoxLosses:
     """Data lost between box and host since the last start; all 0 in a good trial."""
 
     pulses: int = 0
@@ -47,7 +47,7 @@ class Losses:
         return any((self.pulses, self.exposures, self.told_by_box, self.lines, self.unread))
 
 
-class Train:
+class ReportTrain:
     """Checks reports, and counts missing ones.
 
     Args:
@@ -62,7 +62,7 @@ class Train:
         self._last_exposure_us = 0
         self.first_us: int | None = None
         """Time of tick 0 on the box's clock, as the box reports it; None before that."""
-        self.losses = Losses()
+        self.losses = BoxLosses()
 
     @property
     def longest_gap_s(self) -> float:
@@ -145,7 +145,7 @@ class SerialSyncBox:
         self._settings, self._now_ns = settings, now_ns
         self._port: SyncPort | None = None
         self._running = False
-        self._train: Train | None = None
+        self._train: ReportTrain | None = None
         self._early: list[str] = []
         self._pulses: list[int] = []
         self._exposures: list[int] = []
@@ -218,7 +218,7 @@ class SerialSyncBox:
         port.ask(f"ARM {millihertz / 1000:.3f} {seed} 0 {code}", "OK ARM")
         with port.news:
             # no report of an older train follows the answer to ARM
-            self._train = Train(millihertz, seed, code)
+            self._train = ReportTrain(millihertz, seed, code)
             self._pulses, self._exposures, self._early = [], [], []
             port.lines.wrong = 0
             self._asked_ns = self._now_ns()
@@ -294,10 +294,10 @@ class SerialSyncBox:
         port.ask("STOP", "OK STOP")
 
     @property
-    def losses(self) -> Losses:
+    def losses(self) -> BoxLosses:
         """Losses of the last train."""
         if self._port is None or self._train is None:
-            return Losses()
+            return BoxLosses()
         with self._port.news:
             return replace(self._train.losses, lines=self._port.lines.wrong)
 
@@ -357,7 +357,7 @@ class SerialSyncBox:
                 self._keep(self._exposures, since_us, train)
         return True
 
-    def _begin_or_end(self, train: Train, body: str) -> None:
+    def _begin_or_end(self, train: ReportTrain, body: str) -> None:
         if body.startswith("OK GO ") and train.first_us is None:
             train.first_us = whole(body.removeprefix("OK GO "))
             early, self._early = self._early, []
@@ -367,7 +367,7 @@ class SerialSyncBox:
             train.end(whole(body.removeprefix("OK STOP ")))
 
     @staticmethod
-    def _keep(waiting: list[int], us: int, train: Train) -> None:
+    def _keep(waiting: list[int], us: int, train: ReportTrain) -> None:
         if len(waiting) < MOST_WAITING:
             waiting.append(us)
         else:

@@ -27,7 +27,7 @@ ANSWER_S = 3.0
 """Timeout of a call, s."""
 
 
-class Stamping(NamedTuple):
+class VideoStamping(NamedTuple):
     """The source of time stamps, and their grade."""
 
     means: str
@@ -59,7 +59,7 @@ class UvcCamera:
     def __init__(self, settings: UvcSettings, px_per_mm: float) -> None:
         self.settings, self.px_per_mm = settings, px_per_mm
         self.mid_exposure_ns = round(settings.exposure_us * 500)
-        self.stamping = Stamping("host arrival", "host arrival")
+        self.stamping = VideoStamping("host arrival", "host arrival")
         self._size = settings.width_px, settings.height_px
         self._running = False
         self._last: Taken | None = None

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from benchmarks.clocks import DRIFT_PPM, Train, make_train
+from benchmarks.clocks import DRIFT_PPM, StampTrain, make_train
 from sliplab.analysis.clocks.clock_line import _HIDDEN, ClockLine, _hidden, fit_line
 from sliplab.analysis.clocks.clocks import BEND_PPM_S, ClockRefused, fit_clock
 
@@ -34,7 +34,7 @@ def line_of(x: Floats, y: Floats, resolution_ns: float = 0.0) -> ClockLine:
     return fit_line(x, y, resolution_ns, BEND_PER_NS)
 
 
-def error(made: Train) -> tuple[float, float, int]:
+def error(made: StampTrain) -> tuple[float, float, int]:
     """Return the error of a train's fit where it is vouched for, what is stated, and its pieces."""
     fit = fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
     vouched = (made.true >= fit.first_ns) & (made.true <= fit.last_ns)
@@ -42,7 +42,7 @@ def error(made: Train) -> tuple[float, float, int]:
     return float(away.max()), fit.uncertainty_ns, len(fit.map.drift)
 
 
-def bent(rng: np.random.Generator, deviations: float, place: float) -> Train:
+def bent(rng: np.random.Generator, deviations: float, place: float) -> StampTrain:
     """Make a train with a bend that stands out of the jitter by so many standard deviations."""
     pulses = 0.42 * SECONDS * 1e9 / TICK_NS
     scatter = (place**3 * (1 - place) ** 3 / 3) ** 0.5

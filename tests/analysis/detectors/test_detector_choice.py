@@ -6,21 +6,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.detectors import detector_comparison
-from sliplab.analysis.detectors.detector_comparison import Judged, allowed_early, merit, set_levels
-from sliplab.analysis.detectors.detectors import Evidence, Levels
+from sliplab.analysis.detectors.detector_comparison import (
+    TrialEvidence,
+    allowed_early,
+    merit,
+    set_levels,
+)
+from sliplab.analysis.detectors.detectors import Levels, WindowEvidence
 from sliplab.analysis.detectors.latency import TrialLatency, TrueSlip
-from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing, settled
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing, settled
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 EARLY = 30 * MS
 
 
-def judged(incipient: list[float], gross: list[float], onset: int = 4, second: int = 7) -> Judged:
+def judged(
+    incipient: list[float], gross: list[float], onset: int = 4, second: int = 7
+) -> TrialEvidence:
     n = len(incipient)
     ends = 30 * MS * np.arange(1, n + 1, dtype=np.int64)
-    return Judged(
-        Evidence(ends, np.array(incipient, float), lambda first: np.array(gross, float)),
+    return TrialEvidence(
+        WindowEvidence(ends, np.array(incipient, float), lambda first: np.array(gross, float)),
         TrueSlip(onset * 30 * MS, second * 30 * MS, (n + 1) * 30 * MS),
     )
 
@@ -97,10 +104,10 @@ def test_a_missed_onset_is_late_and_a_false_one_is_left_out() -> None:
 
 def counted(
     rows: list[tuple[int, int, int]], onset: int, gross: int = 99, end: int = 100
-) -> Counted:
+) -> SpikeCounts:
     ends = 30 * MS * np.arange(1, len(rows) + 1, dtype=np.int64)
     slip = TrueSlip(onset * 30 * MS, gross * 30 * MS, end * 30 * MS)
-    return Counted(np.array(rows), ends, slip)
+    return SpikeCounts(np.array(rows), ends, slip)
 
 
 def test_the_quickest_pair_within_the_bound_is_chosen() -> None:
@@ -135,7 +142,7 @@ def test_a_margin_that_some_trials_never_reach_is_not_chosen() -> None:
     # two trials slip strongly; the third weakly, less than a stray window's lead
     quiet, stray, gross = (9, 0, 0), (0, 4, 0), (0, 0, 9)
 
-    def trial(slip: tuple[int, int, int]) -> Counted:
+    def trial(slip: tuple[int, int, int]) -> SpikeCounts:
         rows = [*[quiet] * 3, stray, *[quiet] * 4, *[slip] * 8, *[gross] * 8]
         return counted(rows, 8, 16)
 

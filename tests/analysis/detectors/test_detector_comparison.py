@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.detectors.detector_comparison import Parts, compare, thinned
-from sliplab.analysis.detectors.detectors import Labelled, Predictions
+from sliplab.analysis.detectors.detectors import Predictions, TrialWithSlip
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import OnsetReference, References
-from sliplab.protocols.settings import Comparison, Detection, Windows
+from sliplab.protocols.settings import ComparisonSettings, Detection, Windows
 from sliplab.storage.schema.evaluation import DetectorComparison, PartTrials
 
 MS = 1_000_000
 WINDOWS = Windows()
-SETTINGS = Detection(smoothing_grid=(1, 4), compare=Comparison(rates=(0.0, 0.2), train_trials=9))
+SETTINGS = Detection(
+    smoothing_grid=(1, 4), compare=ComparisonSettings(rates=(0.0, 0.2), train_trials=9)
+)
 
 
-def trial(seed: int, stride: int) -> Labelled:
+def trial(seed: int, stride: int) -> TrialWithSlip:
     """Each millisecond's spikes and events from the state it is in; windows sum 30 of them."""
     rng = np.random.default_rng(seed)
     onset, gross, end = 600 + int(rng.integers(0, 90)), 1300, 2000
@@ -36,7 +38,7 @@ def trial(seed: int, stride: int) -> Labelled:
     ends = np.arange(30, end + 1, stride)
     counts = sums[ends] - sums[ends - 30]
     slip = TrueSlip(onset * MS, gross * MS, int(ends[-1] + 1) * MS)
-    return Labelled(Predictions(counts, counts.sum(axis=1), ends * MS), slip)
+    return TrialWithSlip(Predictions(counts, counts.sum(axis=1), ends * MS), slip)
 
 
 def parts(validation: int = 10, test: int = 10) -> Parts:
@@ -94,7 +96,7 @@ def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparis
 
 
 def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> None:
-    def seen(every: list[Labelled]) -> list[Labelled]:
+    def seen(every: list[TrialWithSlip]) -> list[TrialWithSlip]:
         return [replace(t, references=references(t.slip)) for t in every]
 
     def references(slip: TrueSlip) -> References:

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.detectors import detectors
-from sliplab.analysis.detectors.detectors import Labelled, Levels, Predictions, Smoothing, decide
+from sliplab.analysis.detectors.detectors import (
+    Levels,
+    Predictions,
+    Smoothing,
+    TrialWithSlip,
+    decide,
+)
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
@@ -25,17 +31,17 @@ def predictions(counts: np.ndarray, stride_ms: int = 30) -> Predictions:
     )
 
 
-def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> Labelled:
+def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> TrialWithSlip:
     rng = np.random.default_rng(seed)
     means = np.repeat([(9, 3, 3), (3, 9, 4), (2, 4, 9)], [quiet, slipping, sliding], axis=0)
     counts = np.minimum(rng.poisson(means), 30)
     first, second = quiet * LENGTH, (quiet + slipping) * LENGTH
-    return Labelled(predictions(counts), TrueSlip(first, second, second + sliding * LENGTH))
+    return TrialWithSlip(predictions(counts), TrueSlip(first, second, second + sliding * LENGTH))
 
 
 LEARNED = detectors.learn([trial(seed) for seed in range(8)], LENGTH, 30)
 FINE = LEARNED.detectors(1 / 3)
-DETECTORS: dict[str, detectors.Detector] = {
+DETECTORS: dict[str, detectors.EvidenceDetector] = {
     "smoothing": Smoothing(4),
     **LEARNED.detectors(1.0),
     "fine": FINE["hmm counts"],
@@ -114,7 +120,7 @@ def test_the_papers_rule_is_the_same_rule(stride_ms: int) -> None:
 
 def test_states_go_by_the_middle_of_a_window() -> None:
     slip = TrueSlip(2 * LENGTH + 15 * MS, 4 * LENGTH + 16 * MS, 6 * LENGTH)
-    one = Labelled(predictions(np.zeros((6, 3))), slip)
+    one = TrialWithSlip(predictions(np.zeros((6, 3))), slip)
     assert one.states(LENGTH).tolist() == [0, 0, 1, 1, 1, 2]
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detectors import Chain, fit_chain, forward, log_odds
+from sliplab.analysis.detectors.detectors import StateChain, fit_chain, forward, log_odds
 
 LOGS = st.floats(-30, 5, allow_nan=False)
 
@@ -43,7 +43,7 @@ def test_the_filter_is_the_sum_over_all_paths(
     rows: list[tuple[float, ...]], leave: tuple[float, float]
 ) -> None:
     seen = np.array(rows)
-    found = np.exp(forward(Chain(np.array(leave)), seen))
+    found = np.exp(forward(StateChain(np.array(leave)), seen))
     np.testing.assert_allclose(found, enumerated(np.array(leave), seen), rtol=1e-9, atol=1e-300)
 
 
@@ -52,7 +52,7 @@ def test_the_filter_is_the_sum_over_all_paths(
 def test_later_windows_and_constants_of_a_window_change_nothing(
     rows: list[tuple[float, ...]], data: st.DataObject
 ) -> None:
-    chain, seen = Chain(np.array([0.01, 0.02])), np.array(rows)
+    chain, seen = StateChain(np.array([0.01, 0.02])), np.array(rows)
     cut = data.draw(st.integers(1, len(seen)))
     whole = forward(chain, seen)
     other = seen.copy()
@@ -65,7 +65,7 @@ def test_later_windows_and_constants_of_a_window_change_nothing(
 def test_a_long_trial_and_an_impossible_window_do_not_underflow() -> None:
     seen = np.full((100_000, 3), [-1.0, -1.1, -1.2])
     seen[50_000:] = [-5000.0, -4000.0, -4000.5]
-    belief = forward(Chain(np.array([1e-3, 1e-3])), seen)
+    belief = forward(StateChain(np.array([1e-3, 1e-3])), seen)
     assert not np.isnan(belief).any()
     odds = log_odds(belief, 1)
     # certainty is told from greater certainty, far beyond what 1 - p could hold
@@ -76,21 +76,21 @@ def test_a_long_trial_and_an_impossible_window_do_not_underflow() -> None:
 
 def test_it_never_goes_back() -> None:
     seen = np.array([[0.0, -9, -9]] * 3 + [[-9.0, 0, -9]] * 3 + [[-9.0, -9, 0]] * 9)
-    belief = forward(Chain(np.array([0.1, 0.1])), seen)
+    belief = forward(StateChain(np.array([0.1, 0.1])), seen)
     assert belief.argmax(axis=1).tolist() == [0] * 3 + [1] * 3 + [2] * 9
     # windows like those of no slip, after gross slip, make incipient slip no likelier
-    after = forward(Chain(np.array([0.1, 0.1])), np.vstack([seen, seen[:3]]))
+    after = forward(StateChain(np.array([0.1, 0.1])), np.vstack([seen, seen[:3]]))
     assert after[-3:].argmax(axis=1).tolist() == [2] * 3
 
 
 def test_no_windows() -> None:
-    belief = forward(Chain(np.array([0.1, 0.1])), np.empty((0, 3)))
+    belief = forward(StateChain(np.array([0.1, 0.1])), np.empty((0, 3)))
     assert belief.shape == (0, 3)
     assert log_odds(belief, 1).shape == (0,)
 
 
 def test_the_third_state_needs_two_windows() -> None:
-    belief = forward(Chain(np.array([0.5, 0.5])), np.zeros((2, 3)))
+    belief = forward(StateChain(np.array([0.5, 0.5])), np.zeros((2, 3)))
     np.testing.assert_allclose(np.exp(belief), [[0.5, 0.5, 0], [0.25, 0.5, 0.25]])
     assert log_odds(belief, 2)[0] == -np.inf
 
@@ -124,8 +124,8 @@ def test_labels_that_go_back_or_are_none(labels: list[int]) -> None:
 
 def test_wrong_input_is_named() -> None:
     with pytest.raises(ValueError, match="inside 0"):
-        Chain(np.array([0.1, 1.0]))
-    chain = Chain(np.array([0.1, 0.1]))
+        StateChain(np.array([0.1, 1.0]))
+    chain = StateChain(np.array([0.1, 0.1]))
     with pytest.raises(ValueError, match="expected"):
         forward(chain, np.zeros((4, 2)))
     with pytest.raises(ValueError, match="not finite"):

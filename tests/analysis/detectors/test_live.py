@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 
 from sliplab.analysis.detectors import detectors
 from sliplab.analysis.detectors import live as lives
-from sliplab.analysis.detectors.detectors import Chain, Cusum, Detector, Levels, Predictions, Tuned
-from sliplab.analysis.detectors.live import Decision, FreshestArrival, LiveDetector
+from sliplab.analysis.detectors.detectors import (
+    Cusum,
+    EvidenceDetector,
+    Levels,
+    Predictions,
+    StateChain,
+    Tuned,
+)
+from sliplab.analysis.detectors.live import FreshestArrival, LiveDecision, LiveDetector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.windows import bin_events
@@ -86,7 +93,7 @@ def test_a_stream_cut_anywhere_gives_what_the_whole_gives(
     rule = Detection(smoothing=smoothing, margin=margin)
     network = Network()
     live = detector(network, rule)
-    made: list[Decision] = []
+    made: list[LiveDecision] = []
     edges = [0, *sorted(min(place, len(chunk)) for place in cut), len(chunk)]
     for begin, end in itertools.pairwise(edges):
         made += live.push(part(chunk, slice(begin, end)))
@@ -141,13 +148,13 @@ def test_the_rule_step_by_step_is_the_rule(
         [
             detectors.Smoothing(2),
             Cusum(READING),
-            detectors.Filter(Chain(np.array([0.1, 0.2])), READING),
+            detectors.Filter(StateChain(np.array([0.1, 0.2])), READING),
         ]
     ),
     st.floats(0.0, 6.0),
 )
 def test_a_detector_step_by_step_decides_as_on_the_whole(
-    rows: list[tuple[int, ...]], detector: Detector, level: float
+    rows: list[tuple[int, ...]], detector: EvidenceDetector, level: float
 ) -> None:
     counts = np.array(rows, np.int64).reshape(-1, 3)
     seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))

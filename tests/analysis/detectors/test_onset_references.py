@@ -10,7 +10,7 @@ import pytest
 from sliplab.analysis.detectors import onset_references
 from sliplab.analysis.detectors.latency import TrueSlip, score_trial, summarise_latency, true_slip
 from sliplab.analysis.detectors.onset_references import Decided, judge_by_reference, references_of
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.storage.schema.evaluation import DetectorRate
 from sliplab.storage.schema.label import OnsetDoubts, TrialLabel
 from sliplab.storage.trials.recording import Recording
@@ -36,7 +36,9 @@ def decided(
 ) -> Decided:
     found = None if incipient_ms is None else START + incipient_ms * MS
     return Decided(
-        Found(found, None if found is None else START + gross_ms * MS), references, TOLERANCE
+        DetectedOnsets(found, None if found is None else START + gross_ms * MS),
+        references,
+        TOLERANCE,
     )
 
 

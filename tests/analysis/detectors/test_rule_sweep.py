@@ -13,7 +13,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
     summarise_lead,
 )
-from sliplab.analysis.detectors.rule_sweep import Counted, Trials, choose_pair, score, sweep
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, choose_pair, score, sweep
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
 
@@ -22,7 +22,7 @@ SMOOTHINGS, MARGINS = (1, 2, 5), (0.0, 0.5, 1.0, 3.0)
 
 
 @st.composite
-def trials(draw: st.DrawFn) -> list[Counted]:
+def trials(draw: st.DrawFn) -> list[SpikeCounts]:
     found = []
     for _ in range(draw(st.integers(1, 6))):
         n = draw(st.integers(1, 20))
@@ -30,11 +30,11 @@ def trials(draw: st.DrawFn) -> list[Counted]:
         times = sorted(draw(st.lists(st.integers(0, 600), min_size=3, max_size=3)))
         ends = (np.arange(n, dtype=np.int64) + 1) * 30 * MS
         counts = np.array(flat, np.int64).reshape(n, 3)
-        found.append(Counted(counts, ends, TrueSlip(*(t * MS for t in times))))
+        found.append(SpikeCounts(counts, ends, TrueSlip(*(t * MS for t in times))))
     return found
 
 
-def swept(found: list[Counted]) -> tuple[np.ndarray, Trials]:
+def swept(found: list[SpikeCounts]) -> tuple[np.ndarray, Trials]:
     pairs = [sweep(t.counts.astype(np.uint8), t.end_ns, SMOOTHINGS, MARGINS) for t in found]
     tolerance = np.full(len(found), 30 * MS, np.int64)
     slips = [np.array(of) for of in zip(*(vars(t.slip).values() for t in found), strict=True)]
@@ -43,7 +43,7 @@ def swept(found: list[Counted]) -> tuple[np.ndarray, Trials]:
 
 @settings(max_examples=30)
 @given(trials())
-def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
+def test_pairs_and_figures_are_those_of_the_rule(found: list[SpikeCounts]) -> None:
     each, truth = swept(found)
     for s, smoothing in enumerate(SMOOTHINGS):
         for m, margin in enumerate(MARGINS):
@@ -72,7 +72,7 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
 
 @settings(max_examples=30)
 @given(trials(), st.sampled_from((0.0, 0.2, 0.5)))
-def test_the_choice_is_the_evaluations(found: list[Counted], rate: float) -> None:
+def test_the_choice_is_the_evaluations(found: list[SpikeCounts], rate: float) -> None:
     each, truth = swept(found)
     s, m = choose_pair(each, truth, SMOOTHINGS, MARGINS, rate)
     grid = Detection(smoothing_grid=SMOOTHINGS, margin_grid=MARGINS, false_early_rate=rate)

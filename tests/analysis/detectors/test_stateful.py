@@ -16,23 +16,23 @@ from sliplab.analysis.networks.network import (
     set_weights,
     spike_counts,
 )
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 WINDOWS = Windows(length_ms=6, crop_px=160)
-NETWORK = Network(conv1_channels=2, conv2_channels=3, hidden=6, weight_scale=(6, 5, 6, 6))
+NETWORK = NetworkSettings(conv1_channels=2, conv2_channels=3, hidden=6, weight_scale=(6, 5, 6, 6))
 
 
-def network() -> tuple[nn.Sequential, Engine]:
+def network() -> tuple[nn.Sequential, SpikeEngine]:
     """A network whose currents are exact, and the engine that runs it."""
     net = build(NETWORK, WINDOWS, 3)
     values = on_grid(matrices(net))
     set_weights(net, by_parameter(values))
-    return net, Engine(net, WINDOWS.cells)
+    return net, SpikeEngine(net, WINDOWS.cells)
 
 
-def carried(engine: Engine, x: np.ndarray) -> np.ndarray:
+def carried(engine: SpikeEngine, x: np.ndarray) -> np.ndarray:
     return stateful_spikes(engine, SparseWindows.of(x))
 
 

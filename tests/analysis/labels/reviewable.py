@@ -21,7 +21,7 @@ from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChun
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.review import Onsets, Verdict
+from sliplab.storage.trials.review import ReviewedOnsets, Verdict
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT
 
@@ -38,7 +38,7 @@ SKIN_MM = [[0.0, 0.0], *([5.6 * np.cos(a), 5.6 * np.sin(a)] for a in np.arange(6
 EVENTS = 3000
 DOUBTFUL = 700
 """Place in the plan of the trial whose label is in doubt."""
-ADJUSTED = Onsets(300_000_000, 500_000_000)
+ADJUSTED = ReviewedOnsets(300_000_000, 500_000_000)
 """Onsets of an adjusted label."""
 
 
@@ -158,10 +158,10 @@ class Reviewable:
         """Open a trial."""
         return self.item.campaign.recording(trial)
 
-    def decide(self, trial: str, verdict: Verdict, new: Onsets = ADJUSTED) -> None:
+    def decide(self, trial: str, verdict: Verdict, new: ReviewedOnsets = ADJUSTED) -> None:
         """Write a reviewer's decision on a trial's label as it is now."""
         known = label()
-        old = Onsets(known["incipient_ns"], known["gross_ns"])
+        old = ReviewedOnsets(known["incipient_ns"], known["gross_ns"])
         seen = review.counts(self.store, NAME).get(trial, 0)
         known = {"label": self.keys[trial], "old": old, "new": new, "seen": seen}
         review.decide(self.store, NAME, trial, verdict, **known, who="anna", why="because")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.analysis.labels.event_slips import Slips, slips
+from sliplab.analysis.labels.event_slips import PapillaSlips, slips
 
 STEP_S, STILL = 0.005, 100
 PLAY_PX = 0.3
@@ -20,7 +20,7 @@ def trial(
     noise_px: float = 0.02,
     tremor_mm: float = 0.0,
     length_mm: float = 6.0,
-) -> Slips:
+) -> PapillaSlips:
     """One papilla that sticks up to a knee and then follows by a share `after` of its gain.
 
     Its gain falls by a tenth over the way, as a bent papilla's does.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.analysis.labels.plane import Plane, plane_of
+from sliplab.analysis.labels.plane import Perspective, plane_of
 from sliplab.rigs.scene.lens import Lens
 
 SIDE = 832
@@ -30,7 +30,7 @@ def test_straight_on_nothing_is_found() -> None:
 def test_displacement_on_a_tilted_plate_is_the_papillas_own() -> None:
     lens, heights, corners = seen((6.0, -4.0))
     plane = plane_of(corners, np.ones(len(heights), np.bool_), (SIDE, SIDE))
-    assert isinstance(plane, Plane)
+    assert isinstance(plane, Perspective)
     # a papilla that falls with the plate, and does not slip on it
     ride = np.stack((np.full(len(heights), -11.0), heights + 5.0), axis=-1)
     marker, plate = (

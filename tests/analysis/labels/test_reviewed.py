@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.evaluation.evaluation import make_job
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import wanted_models
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from tests.analysis.labels.reviewable import ADJUSTED, NAME, Reviewable, label
 
 
@@ -23,11 +23,11 @@ def made(tmp_path: Path) -> Reviewable:
 def test_decisions_count_only_when_asked(made: Reviewable) -> None:
     one, two, three, four = made.ids[:4]
     made.decide(one, "adjust")
-    made.decide(two, "reject", Onsets())
-    made.decide(three, "accept", Onsets())
-    made.decide(four, "reject", Onsets())
-    made.decide(four, "reopen", Onsets())
-    plain, reviewed = Labels(made.store), Labels(made.store, reviewed=True)
+    made.decide(two, "reject", ReviewedOnsets())
+    made.decide(three, "accept", ReviewedOnsets())
+    made.decide(four, "reject", ReviewedOnsets())
+    made.decide(four, "reopen", ReviewedOnsets())
+    plain, reviewed = StoreLabels(made.store), StoreLabels(made.store, reviewed=True)
     for trial in made.ids[:5]:
         found = plain.read(made.item, made.recording(trial))
         assert found.to_json() == {"key": made.keys[trial], **label()}
@@ -53,14 +53,14 @@ def test_decisions_count_only_when_asked(made: Reviewable) -> None:
 
 
 def test_keys_follow_from_the_onsets_that_were_decided(made: Reviewable) -> None:
-    labels, trial = Labels(made.store, reviewed=True), made.ids[0]
+    labels, trial = StoreLabels(made.store, reviewed=True), made.ids[0]
     keys = [labels.key(made.item, made.recording(trial))]
     for verdict, new in (
         ("adjust", ADJUSTED),
-        ("adjust", Onsets(300_000_000, 500_000_001)),
+        ("adjust", ReviewedOnsets(300_000_000, 500_000_001)),
         ("adjust", ADJUSTED),
-        ("reject", Onsets()),
-        ("accept", Onsets()),
+        ("reject", ReviewedOnsets()),
+        ("accept", ReviewedOnsets()),
     ):
         made.decide(trial, verdict, new)  # type: ignore[arg-type]  # of the two verdicts
         keys.append(labels.key(made.item, made.recording(trial)))
@@ -87,5 +87,5 @@ def test_a_damaged_decision_stops_what_would_use_it(made: Reviewable) -> None:
     path = made.store.folder / "review" / NAME / trial / "000001.json"
     path.write_text("{")
     with pytest.raises(StoreError, match=r"000001\.json"):
-        Labels(made.store, reviewed=True).key(made.item, made.recording(trial))
-    assert Labels(made.store).key(made.item, made.recording(trial)) == made.keys[trial]
+        StoreLabels(made.store, reviewed=True).key(made.item, made.recording(trial))
+    assert StoreLabels(made.store).key(made.item, made.recording(trial)) == made.keys[trial]

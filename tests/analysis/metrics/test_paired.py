@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from sliplab.analysis.metrics.paired import Difference, paired_difference
+from sliplab.analysis.metrics.paired import PairedDifference, paired_difference
 
 
 def test_the_interval_is_that_of_the_paired_test() -> None:
@@ -22,9 +22,9 @@ def test_the_interval_is_that_of_the_paired_test() -> None:
 
 def test_seeds_with_one_figure_only_are_left_out() -> None:
     found = paired_difference([1.0, None, 3.0], [0.5, 1.0, None])
-    assert found == Difference(0.5, None, None, 1)
+    assert found == PairedDifference(0.5, None, None, 1)
     assert found.significant is None
-    assert paired_difference([None], [1.0]) == Difference(None, None, None, 0)
+    assert paired_difference([None], [1.0]) == PairedDifference(None, None, None, 0)
     assert paired_difference([2.0, 3.0], [1.0, 2.0]).significant  # no spread at all
     with pytest.raises(ValueError, match="zip"):
         paired_difference([1.0], [])

@@ -17,7 +17,7 @@ from torch import nn
 
 from sliplab.analysis.networks.external_model import Description, load_external
 from sliplab.analysis.networks.network import spike_counts
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
 from sliplab.protocols.yaml_file import parse_yaml, validate
@@ -109,7 +109,7 @@ def saved(
 def check_counts(found: Any, x: np.ndarray, expected: np.ndarray) -> None:
     """Sinabs' own layers, our engine and the plain kernels count alike."""
     np.testing.assert_array_equal(found.sinabs().counts(x), expected)
-    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    np.testing.assert_array_equal(SpikeEngine(found.fast(), CELLS).counts(x), expected)
 
 
 @pytest.mark.parametrize("batch", [1, 7, 64])

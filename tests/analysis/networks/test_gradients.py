@@ -15,16 +15,22 @@ from torch import nn
 
 from sliplab.analysis.metrics.classification import IntArray
 from sliplab.analysis.networks import gradients
-from sliplab.analysis.networks.gradients import Batch, EventDriven, OnDevice, devices, work_on
+from sliplab.analysis.networks.gradients import (
+    EventDriven,
+    GradientBatch,
+    OnDevice,
+    devices,
+    work_on,
+)
 from sliplab.analysis.networks.network import build, by_parameter, matrices, on_grid, set_weights
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted, fit
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-NETWORK, GAIN = Network(), 0.25
+NETWORK, GAIN = NetworkSettings(), 0.25
 WINDOWS = Windows(length_ms=4)  # a compiler takes longer for each step
 CELLS = WINDOWS.cells
 GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -49,10 +55,10 @@ def samples(n: int, seed: int) -> tuple[SparseWindows, IntArray]:
 def batch_counts(net: nn.Sequential, x: SparseWindows) -> IntArray:
     """By the kernels, with the weights on the grid."""
     set_weights(net, by_parameter(on_grid(matrices(net))))
-    return Engine(net, CELLS).counts(x)
+    return SpikeEngine(net, CELLS).counts(x)
 
 
-def batch(way: Way | None, rows: IntArray, seed: int = 0) -> Batch:
+def batch(way: Way | None, rows: IntArray, seed: int = 0) -> GradientBatch:
     """By torch on a device; by the kernels for None."""
     net = build(NETWORK, WINDOWS, seed)
     work = EventDriven(net, CELLS, GAIN) if way is None else OnDevice(net, GAIN, *way)
@@ -122,7 +128,7 @@ def test_a_gpu_trains_by_the_settings() -> None:
 
 
 def test_convolutions_as_products_give_the_same() -> None:
-    net = build(Network(conv1_kernel=7, conv2_kernel=5), Windows(crop_px=140), 0)
+    net = build(NetworkSettings(conv1_kernel=7, conv2_kernel=5), Windows(crop_px=140), 0)
     x = torch.from_numpy(np.random.default_rng(0).poisson(0.3, (5, 1, 7, 7)).astype(np.float32))
     made: Any = gradients.exact_net(net)
     one, theirs = made.conv1(x), dict(net.named_children())["conv1"](x)

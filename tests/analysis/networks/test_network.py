@@ -10,11 +10,11 @@ from sinabs.utils import validate_memory_mapping_speck
 
 from sliplab.analysis.networks import network
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED, build, spike_counts, weights
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = Network(conv1_channels=2, conv2_channels=4, hidden=8)
+SMALL = NetworkSettings(conv1_channels=2, conv2_channels=4, hidden=8)
 WINDOWS = Windows(length_ms=10, crop_px=120)  # (10, 1, 6, 6)
 
 
@@ -37,20 +37,20 @@ def sparse(n: int, windows: Windows, seed: int, share: float = 0.2) -> np.ndarra
     ],
 )
 def test_the_neuron_is_single_spike_and_reset_to_zero(current: float, expected: list[int]) -> None:
-    net = build(Network(), Windows(), 0)
+    net = build(NetworkSettings(), Windows(), 0)
     for name in SPIKING:
         spikes = getattr(net, name)(torch.full((30, 2), current))
         assert spikes.tolist() == [[s, s] for s in expected]
 
 
 def test_potential_has_no_lower_bound() -> None:
-    net = build(Network(), Windows(), 0)
+    net = build(NetworkSettings(), Windows(), 0)
     spikes = net.iaf1(torch.tensor([-10.0] + [0.5] * 29).unsqueeze(1))  # reaches 1 at the 22nd
     assert np.flatnonzero(spikes[:, 0].numpy()).tolist() == [22, 24, 26, 28]
 
 
 def test_default_sizes_fit_the_chip() -> None:
-    net = build(Network(), Windows(), 0)
+    net = build(NetworkSettings(), Windows(), 0)
     assert {n: tuple(p.shape) for n, p in weights(net).items()} == {
         "conv1.weight": (8, 1, 5, 5),
         "conv2.weight": (16, 8, 3, 3),
@@ -60,7 +60,7 @@ def test_default_sizes_fit_the_chip() -> None:
         "fc2.bias": (12,),
     }
     assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(network.BIASED)
-    plain = weights(build(Network(biases=False, outputs_per_class=1), Windows(), 0))
+    plain = weights(build(NetworkSettings(biases=False, outputs_per_class=1), Windows(), 0))
     assert list(plain) == [f"{name}.weight" for name in WEIGHTED]
     # on the chip a fully connected layer is a convolution over all of its input
     for ins, outs, kernel, stride, padding, side in (
@@ -81,7 +81,7 @@ def test_default_sizes_fit_the_chip() -> None:
     ("windows", "features"), [(Windows(crop_px=140), 16 * 4 * 4), (Windows(polarity="both"), 1600)]
 )
 def test_other_windows(windows: Windows, features: int) -> None:
-    net = build(Network(), windows, 0)
+    net = build(NetworkSettings(), windows, 0)
     assert net.fc1.in_features == features
     assert spike_counts(net, sparse(2, windows, 0)).shape == (2, 3)
 

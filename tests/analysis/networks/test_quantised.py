@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from sliplab.analysis.networks import quantised
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.quantised import chip_run, common_net, common_threshold, quantise
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
 WINDOWS = Windows(length_ms=12, crop_px=140)
 
@@ -38,7 +38,7 @@ def test_thresholds_that_are_none_are_refused() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_spikes_are_those_of_the_chips_arithmetic(seed: int) -> None:
-    network = Network(conv1_channels=4, conv2_channels=6, hidden=9)
+    network = NetworkSettings(conv1_channels=4, conv2_channels=6, hidden=9)
     state = weights(build(network, WINDOWS, seed))
     fitted = Fitted(state, network, WINDOWS, Training(), seed, (), 1, ())
     whole = quantise(build(network, WINDOWS, seed))
@@ -47,4 +47,4 @@ def test_spikes_are_those_of_the_chips_arithmetic(seed: int) -> None:
     expected = chip_run(quantised.quantised_net(fitted, whole), x)
     assert set(expected.saturated.values()) == {0.0}
     assert expected.counts.sum() > 0
-    assert np.array_equal(Engine(common_net(fitted, whole), 7).counts(x), expected.counts)
+    assert np.array_equal(SpikeEngine(common_net(fitted, whole), 7).counts(x), expected.counts)

@@ -23,13 +23,13 @@ from sliplab.analysis.networks.network import (
     set_matrices,
     spike_counts,
 )
-from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SMALL = Network(conv1_channels=3, conv2_channels=4, hidden=9)
+SMALL = NetworkSettings(conv1_channels=3, conv2_channels=4, hidden=9)
 TINY = Windows(length_ms=10, crop_px=120)
 FULL = Windows()
 TAXELS = Windows(length_ms=250, taxels=39, polarity="both")
@@ -48,7 +48,7 @@ def biased(net: nn.Sequential, seed: int) -> nn.Sequential:
     return put(net, values)
 
 
-def gridded(network: Network, windows: Windows, seed: int) -> nn.Sequential:
+def gridded(network: NetworkSettings, windows: Windows, seed: int) -> nn.Sequential:
     """Fresh weights and biases, on the grid."""
     return on_own_grid(biased(build(network, windows, seed), seed))
 
@@ -67,11 +67,11 @@ def sparse(n: int, windows: Windows, seed: int, share: float) -> np.ndarray:
 @pytest.mark.parametrize("share", [0.004, 0.03, 0.5, 80.0])
 def test_spike_counts_are_sinabs_own(share: float) -> None:
     for seed in range(3):
-        net = gridded(Network(), FULL, seed)
+        net = gridded(NetworkSettings(), FULL, seed)
         assert exact(matrices(net))
         x = sparse(24, FULL, seed, share)
         expected = spike_counts(net, x)
-        engine = Engine(net, FULL.cells)
+        engine = SpikeEngine(net, FULL.cells)
         np.testing.assert_array_equal(engine.counts(x), expected)
         np.testing.assert_array_equal(engine.counts(SparseWindows.of(x)), expected)
         assert expected.any() or share < 0.01
@@ -86,7 +86,7 @@ def test_spike_counts_are_sinabs_own(share: float) -> None:
 def test_every_shape_of_network(polarity: str, k1: int, k2: int, outputs: int, crop: int) -> None:
     """One cell a side, an odd number, an even number; channels that fill no vector."""
     windows = Windows(length_ms=8, crop_px=crop, polarity=polarity)
-    network = Network(
+    network = NetworkSettings(
         conv1_channels=3,
         conv2_channels=5,
         hidden=9,
@@ -97,7 +97,7 @@ def test_every_shape_of_network(polarity: str, k1: int, k2: int, outputs: int, c
     )
     net = gridded(network, windows, 1)
     x = sparse(6, windows, 2, 0.5)
-    np.testing.assert_array_equal(Engine(net, windows.cells).counts(x), spike_counts(net, x))
+    np.testing.assert_array_equal(SpikeEngine(net, windows.cells).counts(x), spike_counts(net, x))
 
 
 def test_how_often_each_layer_fires() -> None:
@@ -113,7 +113,7 @@ def test_how_often_each_layer_fires() -> None:
     spike_counts(net, x)
     for hook in hooks:
         hook.remove()
-    _, fired = Engine(net, TINY.cells).spikes(x)
+    _, fired = SpikeEngine(net, TINY.cells).spikes(x)
     each = [seen[n].reshape(5, -1).sum(axis=1) for n in SPIKING]
     np.testing.assert_array_equal(fired, np.stack(each, axis=1))
     assert fired.all()
@@ -129,7 +129,7 @@ def test_extremes(data: st.DataObject) -> None:
     windows = Windows(
         length_ms=5, crop_px=60, polarity=data.draw(st.sampled_from(["positive", "both"]))
     )
-    network = Network(
+    network = NetworkSettings(
         conv1_channels=2,
         conv2_channels=2,
         hidden=3,
@@ -145,7 +145,7 @@ def test_extremes(data: st.DataObject) -> None:
     shape = (data.draw(st.integers(1, 4)), 5, windows.channels, 3, 3)
     counts = st.sampled_from([0, 0, 0, 1, 1, 2, 4, 255])
     x = data.draw(hnp.arrays(np.uint8, shape, elements=counts))
-    engine = Engine(net, windows.cells)
+    engine = SpikeEngine(net, windows.cells)
     expected = spike_counts(net, x)
     np.testing.assert_array_equal(engine.counts(x), expected)
     one_by_one = np.concatenate([spike_counts(net, x[k : k + 1]) for k in range(len(x))])
@@ -159,7 +159,9 @@ def test_extremes(data: st.DataObject) -> None:
 
 def test_a_threshold_that_is_reached_exactly_fires() -> None:
     windows = Windows(length_ms=4, step_ms=1, crop_px=20)
-    network = Network(conv1_channels=1, conv2_channels=1, hidden=1, conv1_kernel=1, conv2_kernel=1)
+    network = NetworkSettings(
+        conv1_channels=1, conv2_channels=1, hidden=1, conv1_kernel=1, conv2_kernel=1
+    )
     net = build(network, windows, 0)
     first, *rest = (np.ones_like(w) for w in matrices(net))
     for value in rest[1:]:
@@ -168,20 +170,20 @@ def test_a_threshold_that_is_reached_exactly_fires() -> None:
     for weight, spikes in ((0.5, 2), (0.5 - GRID[0], 1), (0.2, 1), (0.25, 1), (-1.0, 0)):
         put(net, [np.full_like(first, weight), *rest])
         expected = [[spikes * network.outputs_per_class] * 3]
-        assert Engine(net, 1).counts(x).tolist() == expected
+        assert SpikeEngine(net, 1).counts(x).tolist() == expected
         np.testing.assert_array_equal(spike_counts(net, x), expected)
 
 
 @pytest.mark.parametrize("fill", [0, 1, 255])
 def test_empty_and_saturated_windows(fill: int) -> None:
-    net = gridded(Network(), FULL, 3)
+    net = gridded(NetworkSettings(), FULL, 3)
     x = np.full((3, 30, 1, 20, 20), fill, np.uint8)
     expected = spike_counts(net, x)
-    np.testing.assert_array_equal(Engine(net, 20).counts(x), expected)
+    np.testing.assert_array_equal(SpikeEngine(net, 20).counts(x), expected)
     assert expected.any()  # by the biases alone where there is no event
     plain = put(net, [matrices(net)[0] * 0, *matrices(net)[1:]])
     silent = spike_counts(plain, x)
-    np.testing.assert_array_equal(Engine(plain, 20).counts(x), silent)
+    np.testing.assert_array_equal(SpikeEngine(plain, 20).counts(x), silent)
     if fill == 0:
         np.testing.assert_array_equal(expected, silent)
 
@@ -194,7 +196,7 @@ def test_whole_and_step_by_step_for_long() -> None:
     reset_states(net)
     with torch.no_grad():
         expected = by_class(net(torch.from_numpy(x[0].astype(np.float32)))).numpy()
-    stream = Engine(net, windows.cells).stream()
+    stream = SpikeEngine(net, windows.cells).stream()
     np.testing.assert_array_equal([stream.push(plane) for plane in x[0]], expected)
     assert expected.any()
 
@@ -202,7 +204,7 @@ def test_whole_and_step_by_step_for_long() -> None:
 def test_samples_know_nothing_of_each_other() -> None:
     net = gridded(SMALL, TINY, 0)
     x = np.concatenate([sparse(150, TINY, k, share) for k, share in enumerate((0.05, 2.0))])
-    engine = Engine(net, TINY.cells)
+    engine = SpikeEngine(net, TINY.cells)
     expected = engine.counts(x)
     order = np.random.default_rng(0).permutation(len(x))
     np.testing.assert_array_equal(engine.counts(x[order]), expected[order])
@@ -214,12 +216,12 @@ def test_samples_know_nothing_of_each_other() -> None:
 def test_the_number_of_threads_changes_nothing(threads: int) -> None:
     net = gridded(SMALL, TINY, 0)
     x = sparse(300, TINY, 0, 0.3)
-    engine = Engine(net, TINY.cells)
+    engine = SpikeEngine(net, TINY.cells)
     np.testing.assert_array_equal(engine.counts(x, threads), spike_counts(net, x))
 
 
 def test_threads_do_not_disturb_each_other() -> None:
-    engine = Engine(gridded(SMALL, TINY, 0), TINY.cells)
+    engine = SpikeEngine(gridded(SMALL, TINY, 0), TINY.cells)
     batches = [sparse(20, TINY, k, 0.3) for k in range(8)]
     expected = [engine.counts(x) for x in batches]
     with ThreadPoolExecutor(4) as pool:
@@ -230,7 +232,7 @@ def test_threads_do_not_disturb_each_other() -> None:
 def test_an_engine_has_the_weights_of_its_beginning() -> None:
     net = gridded(SMALL, TINY, 0)
     x = sparse(3, TINY, 0, 0.3)
-    engine = Engine(net, TINY.cells)
+    engine = SpikeEngine(net, TINY.cells)
     before = engine.counts(x)
     put(net, [np.zeros_like(w) for w in matrices(net)])
     np.testing.assert_array_equal(engine.counts(x), before)
@@ -245,7 +247,7 @@ def test_other_thresholds_are_taken_from_the_layers() -> None:
         getattr(net, name).spike_threshold.data.fill_(0.625)
     second = spike_counts(net, x)
     assert (first != second).any()
-    np.testing.assert_array_equal(Engine(net, TINY.cells).counts(x), second)
+    np.testing.assert_array_equal(SpikeEngine(net, TINY.cells).counts(x), second)
 
 
 @pytest.mark.parametrize(
@@ -263,11 +265,11 @@ def test_a_neuron_of_another_kind_is_refused(name: str, value: object) -> None:
     net = build(SMALL, TINY, 0)
     setattr(net.iaf3, name, value)
     with pytest.raises(TypeError, match=r"iaf3|differ"):
-        Engine(net, TINY.cells)
+        SpikeEngine(net, TINY.cells)
 
 
 def test_wrong_samples_are_named() -> None:
-    engine = Engine(build(SMALL, TINY, 0), TINY.cells)
+    engine = SpikeEngine(build(SMALL, TINY, 0), TINY.cells)
     for shape in ((1, 9, 1, 6, 6), (1, 10, 1, 5, 5)):
         with pytest.raises(ValueError, match="expected"):
             engine.counts(np.zeros(shape, np.uint8))
@@ -281,7 +283,7 @@ def test_wrong_samples_are_named() -> None:
 
 
 def test_weights_off_the_grid_or_too_large_are_not_exact() -> None:
-    values = on_grid(matrices(build(Network(), FULL, 0)))
+    values = on_grid(matrices(build(NetworkSettings(), FULL, 0)))
     assert exact(values)
     values[1][0, 0, 0, 0] += np.float32(GRID[1] / 2)
     assert not exact(values)
@@ -296,7 +298,7 @@ def test_weights_off_the_grid_or_too_large_are_not_exact() -> None:
 def test_any_number_of_classes(classes: int, outputs: int) -> None:
     """Of taxels, 78 channels of one cell, over 250 steps; and of a square crop."""
     for windows, share in ((TAXELS, 0.13), (TINY, 0.3)):
-        network = Network(
+        network = NetworkSettings(
             conv1_channels=9,
             conv2_channels=7,
             hidden=11,
@@ -308,7 +310,7 @@ def test_any_number_of_classes(classes: int, outputs: int) -> None:
         expected = spike_counts(net, x)
         assert expected.shape == (5, classes)
         assert expected.any()
-        engine = Engine(net, windows.cells)
+        engine = SpikeEngine(net, windows.cells)
         np.testing.assert_array_equal(engine.counts(x), expected)
         stream = engine.stream()
         steps = np.array([stream.push(plane) for plane in x[0]])

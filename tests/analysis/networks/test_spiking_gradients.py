@@ -19,10 +19,10 @@ from sliplab.analysis.networks.network import (
     parameters,
     reset_states,
 )
-from sliplab.analysis.networks.spiking import Job, Trainer, WindowLoss
+from sliplab.analysis.networks.spiking import GradientJob, Trainer, WindowLoss
 from sliplab.analysis.networks.spiking_gradients import _through
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 from tests.analysis.networks import test_spiking
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, gridded, sparse
 
@@ -61,7 +61,7 @@ def by_events(
     net: nn.Sequential, x: np.ndarray, y: torch.Tensor, cells: int, gain: float = 1.0
 ) -> tuple[torch.Tensor, list[np.ndarray]]:
     trainer = Trainer(net, cells)
-    job = Job(trainer, SparseWindows.of(x), np.arange(len(x)), y.numpy(), gain)
+    job = GradientJob(trainer, SparseWindows.of(x), np.arange(len(x)), y.numpy(), gain)
     loss = WindowLoss.apply(job, *trainer.leaves) / len(x)
     grads = torch.autograd.grad(loss, trainer.leaves)
     counts = torch.from_numpy(job.counts)
@@ -115,7 +115,7 @@ def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
     ("windows", "share"), [(TINY, 0.1), (TINY, 0.3), (FULL, 0.01), (FULL, 0.03)]
 )
 def test_gradients_are_sinabs_own(windows: Windows, share: float) -> None:
-    network = Network() if windows is FULL else SMALL
+    network = NetworkSettings() if windows is FULL else SMALL
     for seed in range(2):
         x = sparse(6, windows, seed, share)
         y = torch.tensor([0, 1, 2, 0, 1, 2])
@@ -131,7 +131,7 @@ def test_gradients_are_sinabs_own(windows: Windows, share: float) -> None:
 
 def test_where_sums_cancel_the_error_is_that_of_float32() -> None:
     """Twenty times the events of a real window: Sinabs' own gradients are 2e-6 off there."""
-    net = gridded(Network(), FULL, 0)
+    net = gridded(NetworkSettings(), FULL, 0)
     x = sparse(6, FULL, 0, 0.3)
     y = torch.tensor([0, 1, 2, 0, 1, 2])
     true = in_double(net, x, y)
@@ -143,7 +143,7 @@ def test_where_sums_cancel_the_error_is_that_of_float32() -> None:
 @pytest.mark.parametrize(("k1", "k2", "outputs"), [(1, 1, 1), (3, 5, 2), (7, 3, 4), (1, 7, 11)])
 def test_every_shape_of_network(k1: int, k2: int, outputs: int) -> None:
     windows = Windows(length_ms=8, crop_px=100, polarity="both")
-    network = Network(
+    network = NetworkSettings(
         conv1_channels=3,
         conv2_channels=5,
         hidden=9,
@@ -223,7 +223,7 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
 @pytest.mark.parametrize("classes", [2, 5, 36])
 @pytest.mark.parametrize("windows", [TINY, TAXELS], ids=["crop", "taxels"])
 def test_gradients_of_any_number_of_classes(classes: int, windows: Windows) -> None:
-    network = Network(
+    network = NetworkSettings(
         conv1_channels=9,
         conv2_channels=7,
         hidden=11,

@@ -19,12 +19,12 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.synaptic import count_work, reached
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
 WINDOWS = Windows(length_ms=8, crop_px=140, polarity="both")  # (8, 2, 7, 7): an odd side
 
 
-def untrained(network: Network, windows: Windows) -> Fitted:
+def untrained(network: NetworkSettings, windows: Windows) -> Fitted:
     net = build(network, windows, 3)
     values = matrices(net)
     for value in values[2:]:
@@ -45,7 +45,9 @@ def test_reach_is_the_column_sum_of_torchs_convolution(kernel: int, stride: int,
 
 @pytest.mark.parametrize("biases", [True, False])
 def test_operations_are_those_of_sinabs_spikes_followed_one_by_one(biases: bool) -> None:
-    network = Network(conv1_channels=3, conv2_channels=4, hidden=5, conv1_kernel=5, biases=biases)
+    network = NetworkSettings(
+        conv1_channels=3, conv2_channels=4, hidden=5, conv1_kernel=5, biases=biases
+    )
     fitted = untrained(network, WINDOWS)
     rng = np.random.default_rng(0)
     x = rng.poisson(0.4, (70, 8, 2, 7, 7)).astype(np.uint8)  # more than a thread takes at a time
@@ -95,4 +97,4 @@ def _shape_of(layer: nn.Module) -> dict[str, object]:
 
 def test_no_windows_are_no_work() -> None:
     none = SparseWindows.of(np.zeros((0, 8, 2, 7, 7), np.uint8))
-    assert count_work(untrained(Network(), WINDOWS), none) is None
+    assert count_work(untrained(NetworkSettings(), WINDOWS), none) is None

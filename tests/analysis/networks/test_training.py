@@ -26,11 +26,11 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.training import Fitted, fit, learning_rate, predict_counts, restore
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
+NETWORK = NetworkSettings(conv1_channels=4, conv2_channels=4, hidden=12)
 WINDOWS = Windows(length_ms=12, crop_px=160)  # (12, 1, 8, 8)
 TRAINING = Training(
     epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0, mirror=False
@@ -194,7 +194,7 @@ def test_a_training_goes_on_to_the_same_bits(stop: int, schedule: str) -> None:
 def test_a_damaged_state_is_refused(spoilt: bytes | None) -> None:
     if spoilt is None:  # whole, but of another network
         states: list[bytes] = []
-        other = Network(conv1_channels=3, conv2_channels=4, hidden=12)
+        other = NetworkSettings(conv1_channels=3, conv2_channels=4, hidden=12)
         few = TRAINING.model_copy(update={"epochs": 1})
         fit(*TRAIN, *VAL, other, WINDOWS, few, 0, on_state=states.append)
         spoilt = states[0]

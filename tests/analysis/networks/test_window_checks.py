@@ -9,12 +9,12 @@ from sliplab.analysis.networks import window_checks
 from sliplab.analysis.networks.training import Fitted, fit
 from sliplab.analysis.networks.window_checks import CheckFailed, check_chance, check_permutations
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.storage.schema.evaluation import Classification
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-NETWORK = Network(conv1_channels=2, conv2_channels=2, hidden=8, conv1_kernel=3)
+NETWORK = NetworkSettings(conv1_channels=2, conv2_channels=2, hidden=8, conv1_kernel=3)
 WINDOWS = Windows(length_ms=6, crop_px=80)  # (6, 1, 4, 4)
 HOW = Training(
     epochs=8, batch=16, learning_rate=2e-2, patience=8, schedule="constant", gain=1.0, mirror=False

@@ -8,12 +8,12 @@ from typing import Any
 from sliplab.analysis.detectors import onset_references
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, Name, OnsetReference
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.report.onsets import Explained, OnsetSection, onset_section
 from sliplab.analysis.report.page import render_section
 from sliplab.storage.schema import evaluation
 from sliplab.storage.schema.evaluation import DetectorComparison, DetectorRate, OnsetFigures
-from sliplab.storage.schema.summary import Kinematic, Network, Summary
+from sliplab.storage.schema.summary import Kinematic, NetworkSummary, Summary
 
 MS = 1_000_000
 LABEL: dict[Name, OnsetReference] = {
@@ -33,7 +33,7 @@ def figures(
     """Decisions on trials with the same onsets; those of gross slip at 1550 ms."""
     return onset_references.judge_by_reference(
         [
-            Decided(Found(None if at is None else at * MS, 1550 * MS), references, 30 * MS)
+            Decided(DetectedOnsets(None if at is None else at * MS, 1550 * MS), references, 30 * MS)
             for at in incipient_ms
         ]
     )
@@ -56,7 +56,7 @@ def summary(
         for name, of in detectors.items()
     )
     kinematic = Kinematic.model_construct(by_reference=dict(own))
-    other = Network.model_construct(title="preset: paper", kinematic=kinematic)
+    other = NetworkSummary.model_construct(title="preset: paper", kinematic=kinematic)
     compared = DetectorComparison.model_construct(detectors=scores, carried=None)
     found: Any = Summary.model_construct(
         kinematic=kinematic,

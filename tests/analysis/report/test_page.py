@@ -11,13 +11,18 @@ from xml.etree import ElementTree
 import pytest
 
 from sliplab.analysis.report.figures import campaign, clocks, intervals, trials
-from sliplab.analysis.report.figures.intervals import Panel, Share, by_condition, differences
+from sliplab.analysis.report.figures.intervals import (
+    Panel,
+    ShareInterval,
+    by_condition,
+    differences,
+)
 from sliplab.analysis.report.outcomes import FailureSection
-from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
+from sliplab.analysis.report.page import Content, PageFigure, Table, csv_text, render_page
 from sliplab.analysis.report.trial import TrialSection
 from sliplab.plugins.studies.generalise.section import SkinSection
-from sliplab.plugins.studies.plot import Panel as Pair
-from sliplab.plugins.studies.plot import Point, cost_and_error
+from sliplab.plugins.studies.plot import AxisPair as Pair
+from sliplab.plugins.studies.plot import DetectorPoint, cost_and_error
 
 EVIL = "<img src=x onerror=alert(1)>"
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
@@ -30,8 +35,11 @@ LEAD = Panel(
     published=(360.0, "paper's smallest"),
     notes={ROWS[0]: "2 missed"},
 )
-DEPTHS = [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]
-POINTS = [Point({"x": 10.0, "y": 90.0}, True, False), Point({"x": 20.0, "y": 95.0}, False, True)]
+DEPTHS = [ShareInterval("2.4 mm", 0.9, 0.85, 0.95), ShareInterval("2.6 mm", None, None, None)]
+POINTS = [
+    DetectorPoint({"x": 10.0, "y": 90.0}, True, False),
+    DetectorPoint({"x": 20.0, "y": 95.0}, False, True),
+]
 WINDOWS = "windows classified correctly (%)"
 DRAWN: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "by_condition": (
@@ -108,7 +116,7 @@ def test_a_figures_data_are_columns_with_units() -> None:
 
 
 def test_a_page_escapes_everything_but_its_figures() -> None:
-    figure = Figure(SVG, "name", {})
+    figure = PageFigure(SVG, "name", {})
     commands = Table((EVIL, "command"), [[EVIL, f"sliplab view {EVIL}"]], commands=(1,))
     sections = (
         TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, EVIL, figure),
@@ -124,9 +132,9 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     assert "Paper, on its own robot:" in page
     assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
-    torn = render(TrialSection("a", {}, "", False, "", Figure(SVG), "is cut short"))
+    torn = render(TrialSection("a", {}, "", False, "", PageFigure(SVG), "is cut short"))
     assert "It is not whole: it was salvaged from a file that is cut short." in torn
-    plain = render(TrialSection("a", {}, "", False, "", Figure(SVG)))
+    plain = render(TrialSection("a", {}, "", False, "", PageFigure(SVG)))
     assert "not whole" not in plain
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]

@@ -17,7 +17,13 @@ from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema import evaluation
 from sliplab.storage.schema.evaluation import Accuracy, AlarmRate, Seeds, SeedScores, TrialLatency
-from sliplab.storage.schema.summary import Experiment, Kinematic, Network, Summary, TrialOutcome
+from sliplab.storage.schema.summary import (
+    Experiment,
+    Kinematic,
+    NetworkSummary,
+    Summary,
+    TrialOutcome,
+)
 
 
 def seeds(*strict: float) -> Seeds:
@@ -25,7 +31,7 @@ def seeds(*strict: float) -> Seeds:
         SeedScores(seed=k, chosen=not k, validation_strict=None, strict=it, argmax=it, margin=it)
         for k, it in enumerate(strict)
     )
-    spread = evaluation.Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
+    spread = evaluation.SeedSpread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
     return Seeds(each=each, spread={"strict": spread})
 
 
@@ -70,7 +76,7 @@ def summary(alarms: dict[str, AlarmRate], of_seeds: Seeds) -> Summary:
         **figures(slides),
     )
     gravity = Experiment.model_construct(**figures(falls))
-    preset = Network.model_construct(
+    preset = NetworkSummary.model_construct(
         title="", preset="paper", gravity=Experiment.model_construct(**figures(falls[2:]))
     )
     return Summary.model_construct(

@@ -7,7 +7,7 @@ import pytest
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.windows import WorkSection, work_section
 from sliplab.storage.schema import evaluation
-from sliplab.storage.schema.evaluation import Seeds, SeedScores, Share, Spread, TrainedBaseline
+from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedSpread, Share, TrainedBaseline
 from sliplab.storage.schema.summary import Kinematic
 
 
@@ -23,7 +23,7 @@ def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSect
         events=7.0,
         n=5,
     )
-    mean = Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
+    mean = SeedSpread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
     each = tuple(
         SeedScores(
             seed=k, chosen=not k, validation_strict=None, argmax=share, strict=share, margin=share

@@ -9,16 +9,22 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.latency import score_trial, true_slip
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.evaluation import evaluation as evaluations
 from sliplab.analysis.evaluation import windows
 from sliplab.analysis.evaluation.trials import summaries
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification, window_groups
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema import evaluation
-from sliplab.storage.schema.evaluation import Calibration, Coverage, Deviation, NoSlip, TrialScore
+from sliplab.storage.schema.evaluation import (
+    ChangePointCoverage,
+    NoSlip,
+    ProbabilityCalibration,
+    SignedDeviation,
+    TrialScore,
+)
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from tests.analysis.labels.reviewable import NAME, Reviewable
@@ -27,7 +33,7 @@ MS = 1_000_000
 TRIALS = 110
 """12 of them are test trials."""
 RULE = Detection()
-NOTHING = Deviation(n=0, median=None, median_abs=None, max_abs=None)
+NOTHING = SignedDeviation(n=0, median=None, median_abs=None, max_abs=None)
 NO_SHARE = evaluation.Share(share=None, low=None, high=None, n=0, trials=0)
 
 
@@ -60,7 +66,7 @@ class Evaluated(Reviewable):
         }
         self.change(trial, intervals=stated)
 
-    def row(self, trial: str, label: TrialLabel, found: Found) -> TrialScore:
+    def row(self, trial: str, label: TrialLabel, found: DetectedOnsets) -> TrialScore:
         """Score a trial as an evaluation does."""
         slip = true_slip(label)
         tolerance = round(RULE.false_early_ms * MS)
@@ -89,9 +95,9 @@ class Evaluated(Reviewable):
                 self.label(trial).per_marker_ns[1],
                 self.label(trial).per_marker_ns[0],
             )
-            found = Found(incipient + round(late * MS), gross + round(late * MS))
+            found = DetectedOnsets(incipient + round(late * MS), gross + round(late * MS))
             rows.append(self.row(trial, self.label(trial), found))
-        labels = Labels(self.store)
+        labels = StoreLabels(self.store)
         train = load_samples(labels, [self.item], "train")
         load_samples(labels, [self.item], "validation")
         test = load_samples(labels, [self.item], "test")
@@ -109,7 +115,7 @@ class Evaluated(Reviewable):
                 **dict(classification.score(counts, test.y, 2.0)),
                 interval=window_groups.share(hits, test.trial),
                 reliability=(),
-                calibration=Calibration(
+                calibration=ProbabilityCalibration(
                     temperature=None, ece=None, cross_entropy=None, uncalibrated=None
                 ),
                 by_factor={},
@@ -127,7 +133,7 @@ class Evaluated(Reviewable):
                 paper=by_onset,
                 change_point=by_onset,
                 apart=by_onset,
-                papillae=Coverage(**dict(NOTHING), coverage=None),
+                papillae=ChangePointCoverage(**dict(NOTHING), coverage=None),
             ),
             detection={NAME: RULE},
             choices={NAME: None},

@@ -18,7 +18,7 @@ from sliplab.analysis.review.doubt import (
 )
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from tests.analysis.labels.reviewable import NAME, Reviewable, displacements, frame_times, label
 
 MS = 1_000_000
@@ -139,7 +139,7 @@ def test_a_hidden_onset_lies_anywhere_since_the_motion_began(made: Reviewable) -
     relabel(made, two, incipient_ns=None, gross_ns=None, doubts=hidden, intervals=stated, **seen)
     relabel(made, three, gross_ns=None, per_marker_ns=[-1, INCIPIENT])
     found = doubts(made)
-    assert found[one].onsets == found[two].onsets == Onsets(INCIPIENT, GROSS)
+    assert found[one].onsets == found[two].onsets == ReviewedOnsets(INCIPIENT, GROSS)
     start = made.recording(one).motion_ns[0]
     assert found[one].spread_ms["incipient"] == pytest.approx(
         (INCIPIENT - start) / MS / np.sqrt(12)
@@ -154,7 +154,7 @@ def test_a_hidden_onset_lies_anywhere_since_the_motion_began(made: Reviewable) -
 
 def test_drawn_onsets_stand_in_order_and_are_lost_as_often_as_said() -> None:
     doubt = LabelDoubt(
-        Onsets(INCIPIENT, GROSS), 600 * MS, {"incipient": 100.0, "gross": 100.0}, 0.3, 3, ()
+        ReviewedOnsets(INCIPIENT, GROSS), 600 * MS, {"incipient": 100.0, "gross": 100.0}, 0.3, 3, ()
     )
     incipient, gross, usable = doubt.draw(4000, 5)
     assert (gross >= incipient).all()
@@ -165,10 +165,12 @@ def test_drawn_onsets_stand_in_order_and_are_lost_as_often_as_said() -> None:
 def test_older_labels_suggest_their_markers_onsets() -> None:
     data = {"incipient_ns": None, "gross_ns": None, "end_ns": 1, "per_marker_ns": [9, -1, 4]}
     old = TrialLabel.model_validate(data)
-    assert suggested_onsets(old, 0) == Onsets(4, 9)
+    assert suggested_onsets(old, 0) == ReviewedOnsets(4, 9)
     # in a twist gross slip is not the centre's, as the rule's own onsets say
     paper = {"incipient_ns": 4, "gross_ns": 7}
-    assert suggested_onsets(TrialLabel.model_validate({**data, "paper": paper}), 0) == Onsets(4, 7)
+    assert suggested_onsets(
+        TrialLabel.model_validate({**data, "paper": paper}), 0
+    ) == ReviewedOnsets(4, 7)
 
 
 def test_levels_are_taken_out() -> None:

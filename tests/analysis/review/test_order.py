@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.smoothing_rule import Found
+from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.evaluation.trials import summaries
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import window_groups
-from sliplab.analysis.review.influence import DRAWS, Drawn, Figure
+from sliplab.analysis.review.influence import DRAWS, ReviewDraws, ReviewStatistic
 from sliplab.analysis.review.order import TRAINING, ReviewOrder, review_order
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.storage.schema.evaluation import ExperimentScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from tests.analysis.labels.reviewable import NAME
 from tests.analysis.review.evaluated import MS, TRIALS, Evaluated
 
@@ -41,7 +41,7 @@ def order(made: Evaluated) -> ReviewOrder:
     return review_order(made.store, [made.item])
 
 
-def figure(found: ReviewOrder, name: str) -> Figure:
+def figure(found: ReviewOrder, name: str) -> ReviewStatistic:
     (one,) = [it for it in found.figures if (it.name, it.experiment) == (name, "kinematic")]
     return one
 
@@ -100,7 +100,7 @@ def moved_rows(
 ) -> list[TrialScore]:
     """The rows with one trial scored again by another label."""
     row = rows[place]
-    found = Found(row.detected_incipient_ns, row.detected_gross_ns)
+    found = DetectedOnsets(row.detected_incipient_ns, row.detected_gross_ns)
     return [*rows[:place], made.row(row.trial, label, found), *rows[place + 1 :]]
 
 
@@ -136,7 +136,7 @@ def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: st
     rows = made.evaluate(latencies)
     found = order(made)
     (item,) = found.trials
-    drawn = Drawn.of(item.name, item.doubt)
+    drawn = ReviewDraws.of(item.name, item.doubt)
     assert 0 <= (~drawn.usable).sum() < len(drawn.usable)
     before = summaries(rows)["kinematic"]
     names = [f"{statistic} {title}" for title in FIGURES for statistic in ("median", "mean")]
@@ -166,8 +166,8 @@ def test_accuracy_changes_with_the_classes_of_its_windows(made: Evaluated) -> No
     made.evaluate(np.linspace(20, 90, len(made.tests)).tolist())
     found = order(made)
     (item,) = found.trials
-    drawn = Drawn.of(item.name, item.doubt)
-    samples = load_samples(Labels(made.store), [made.item], "test")
+    drawn = ReviewDraws.of(item.name, item.doubt)
+    samples = load_samples(StoreLabels(made.store), [made.item], "test")
     counts = Derived.of(made.store, "windows").arrays("test")["counts"]
     ours = np.array([samples.trials[k].trial == trial for k in samples.trial])
     before = window_groups.share(window_groups.strict_hits(counts, samples.y), samples.trial).share
@@ -194,7 +194,7 @@ def test_training_trials_move_training_and_nothing_else(made: Evaluated) -> None
     shares = {item.trial: item.moves[0].change for item in found.trials}
     assert {item.split for item in found.trials} == {"train"}
     assert all([move.figure for move in item.moves] == [TRAINING] for item in found.trials)
-    labels = Labels(made.store)
+    labels = StoreLabels(made.store)
     parts = [load_samples(labels, [made.item], split) for split in ("train", "validation")]
     total = sum(map(len, parts))
     windows = np.bincount(parts[0].trial)[0]
@@ -244,7 +244,7 @@ def test_decisions_tell_how_many_are_unusable(made: Evaluated) -> None:
     for trial in made.tests[:7]:
         made.change(trial, **GRAVELY)
     for trial in made.tests[:6]:
-        made.decide(trial, "reject", Onsets())
+        made.decide(trial, "reject", ReviewedOnsets())
     (item,) = order(made).trials
     assert item.doubt.unusable == pytest.approx((10 * 0.5 + 6) / 16)
     assert (item.campaign, item.trial) == (NAME, made.tests[6])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.analysis.sweeps.runner import Advance, Arrays, ResultFile, Sweep, Task, task_sweep
+from sliplab.analysis.sweeps.runner import Advance, Arrays, ResultFile, Sweep, SweepTask, task_sweep
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.document import Document
@@ -129,8 +129,8 @@ def test_a_file_of_results_keeps_its_head(tmp_path: Path) -> None:
     assert not kept.fresh("a", "k")
     with pytest.raises(FileNotFoundError):
         kept.load()
-    task_sweep([Task(name, "k", lambda: Value(value=1)) for name in "ba"], kept).run()
-    task_sweep([Task("b", "other", lambda: Value(value=2))], kept).run()
+    task_sweep([SweepTask(name, "k", lambda: Value(value=1)) for name in "ba"], kept).run()
+    task_sweep([SweepTask("b", "other", lambda: Value(value=2))], kept).run()
     assert json.loads(kept.path.read_text()) == {
         "change": 0.2,
         "squares": {"b": {"key": "other", "value": 2}, "a": {"key": "k", "value": 1}},
@@ -144,5 +144,5 @@ def test_a_stale_result_of_another_shape_is_made_again_and_a_damaged_one_is_name
     write_json(kept.path, {"squares": {"a": {"key": "old", "values": [1]}}})
     with pytest.raises(StoreError, match=r"results\.json: squares\.a\.value: is missing.*delete"):
         kept.load()
-    assert task_sweep([Task("a", "new", lambda: Value(value=3))], kept).run() == 1
+    assert task_sweep([SweepTask("a", "new", lambda: Value(value=3))], kept).run() == 1
     assert kept.load().squares["a"].value == 3

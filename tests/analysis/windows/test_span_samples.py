@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected, class_names, collected, of_classes
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.windows.sample_sets import load_class_samples
 from sliplab.flows.label import label
 from sliplab.protocols import InputError
@@ -49,7 +49,7 @@ def test_windows_lie_in_their_part_and_are_drawn_where_there_are_more(item: Coll
     assert of_classes(campaigns)
     assert class_names(campaigns) == ("9", "10")
     assert label(store, campaigns)["done"] == 3
-    labels = Labels(store)
+    labels = StoreLabels(store)
     train = load_class_samples(labels, campaigns, "train")
     by_name = {
         (train.trials[k].trial, int(y)): np.sort(

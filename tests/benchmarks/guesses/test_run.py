@@ -21,11 +21,11 @@ from benchmarks.guesses.results import (
 )
 from benchmarks.guesses.run import TRIALS, guess_sweep, measure_guesses
 from benchmarks.guesses.study import STUDY
-from benchmarks.scene_parameters import AS_IT_IS, Setting
+from benchmarks.scene_parameters import AS_IT_IS, ParameterSetting
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.cli.study_command import study_app
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -38,7 +38,9 @@ GUESS = "event_camera.contrast"
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(
+    ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
+) -> Store:
     """A copy of the small study, its contrast measured down and up."""
     folder = tmp_path_factory.mktemp("guesses") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -162,7 +164,7 @@ def test_stopped_between_two_settings_it_goes_on(
     file = other.folder / "derived/guesses/results.json"
     write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
 
-    def stopped(work: StudySensitivity, setting: Setting, scenes: Any) -> SettingScores:
+    def stopped(work: StudySensitivity, setting: ParameterSetting, scenes: Any) -> SettingScores:
         if setting.factor > 1:
             raise KeyboardInterrupt
         return scores(store)[setting.name]

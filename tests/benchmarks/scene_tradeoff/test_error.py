@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks.scene_tradeoff.error import (
     Onsets,
     SceneError,
-    Seen,
+    SceneRun,
     choose_by_windows,
     compare,
     flipped_share,
@@ -22,7 +22,7 @@ from benchmarks.scene_tradeoff.error import (
     tensor_l1,
 )
 from benchmarks.scene_tradeoff.windows import look, pooled
-from sliplab.protocols.settings import Samples, Windows
+from sliplab.protocols.settings import SampleSettings, Windows
 from sliplab.storage.streams import EventChunk
 
 WINDOWS = Windows()
@@ -44,8 +44,8 @@ def seen(
     slips: Onsets = (None, None),
     begin_us: int = 0,
     end_us: int = 300_000,
-) -> Seen:
-    return Seen(chunk, SIZE, begin_us, end_us, slips, markers)
+) -> SceneRun:
+    return SceneRun(chunk, SIZE, begin_us, end_us, slips, markers)
 
 
 def test_the_nth_event_of_a_pixel_and_polarity_meets_the_nth() -> None:
@@ -200,7 +200,7 @@ def test_what_the_samples_hold() -> None:
         (130, 50, 1, 2_020_000),
     )
     run = seen(chunk, (600 * MS, 2000 * MS), begin_us=-1_200_000, end_us=2_900_000)
-    found = look(run, WINDOWS, Samples(per_class=50), 0)
+    found = look(run, WINDOWS, SampleSettings(per_class=50), 0)
     assert found.samples == (50, 46, 30)
     assert found.in_hold == 30  # 50 windows of 30 ms end at 0.6 s: the first 30 before 0
     assert found.seconds == (1.2, 0.6, 1.4, 0.9)
@@ -216,11 +216,11 @@ def test_what_the_samples_hold() -> None:
 
 
 def test_a_trial_that_never_slips_has_no_shares() -> None:
-    found = look(seen(events((130, 50, 1, 15_000))), WINDOWS, Samples(), 0)
+    found = look(seen(events((130, 50, 1, 15_000))), WINDOWS, SampleSettings(), 0)
     assert found.samples == (0, 0, 0)
     found_error = pooled([found])
     assert found_error["hold_share"] is None
     assert found_error["ceiling"] is None
     assert found_error["events_per_s"]["gross"] is None
     with pytest.raises(ValueError, match="no events"):
-        look(seen(None), WINDOWS, Samples(), 0)
+        look(seen(None), WINDOWS, SampleSettings(), 0)

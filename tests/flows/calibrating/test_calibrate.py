@@ -63,7 +63,7 @@ def session(path: Path, **attributes: Any) -> measurement.CalibrationSession:
     return measurement.CalibrationSession(file, rig, date(2026, 12, 1))
 
 
-def taught(finding: measurement.Finding) -> PlateFrame:
+def taught(finding: measurement.MeasurementResult) -> PlateFrame:
     plane = finding.changes["calibration.contact_plane"]
     points = [
         [float(v.removesuffix(" mm")) for v in plane[k]] for k in ("centre", "right", "above")

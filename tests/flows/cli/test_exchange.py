@@ -16,7 +16,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.flows.__main__ import _run
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
@@ -86,7 +86,7 @@ def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
     column = np.arange(200, dtype=np.uint16)
     times = np.concatenate([[0], 1_795_000_000_000_000 + np.arange(199)]).astype(np.int64)
     path = tmp_path / "a.aedat4"
-    with Aedat4Writer(path, {0: Stream("EVTS", "events", (346, 260), "DAVIS346")}) as file:
+    with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (346, 260), "DAVIS346")}) as file:
         file.events(0, EventChunk(column, column, column.astype(np.uint8) % 2, times))
     store = tmp_path / "store"
     code, reported, said = sliplab("import", path, "--store", store, "--name", "a", "--json")

@@ -12,7 +12,7 @@ import pytest
 from bokeh.document import Document
 
 from sliplab.flows.ui.review import TrialList, filtered_rows
-from sliplab.flows.ui.review_page import Page
+from sliplab.flows.ui.review_page import ReviewTab
 from sliplab.storage.trials.store import Store
 from tests.analysis.review.evaluated import Evaluated
 from tests.command_line import here
@@ -90,7 +90,7 @@ def test_the_page_lists_in_this_order(made: Evaluated) -> None:
     assert trials.refresh()
     assert filtered_rows(trials.rows)[0].trial == one
     with ThreadPoolExecutor(1) as pool:
-        page = Page(Document(), trials, pool, "anna")
+        page = ReviewTab(Document(), trials, pool, "anna")
         assert page.see.source.data["trial"][:2] == [one, made.tests[5]]
         assert page.see.first.label == "most change first"
         page.close()

@@ -29,7 +29,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.further_settings import Thermometer
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.thermometer import MockThermometer
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
@@ -496,7 +496,7 @@ def test_readings_do_not_depend_on_how_often_they_are_read() -> None:
 
 
 def test_a_cooling_body_follows_newtons_law() -> None:
-    world = World(MockSettings(seed=3))
+    world = SimulatedWorld(MockSettings(seed=3))
     world.begin_trial(4)
     made = MockThermometer(world, Thermometer(ambient=20, above=5, time_constant_s=10), "w", "degC")
     times = np.array([0, 10_000_000_000, 20_000_000_000], np.int64)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, Measurement
+from sliplab.flows.calibrating.measurement import CalibrationSession, Measurement, MeasurementResult
 from sliplab.flows.cli.rigs import _about
 from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.preflight import check_devices
@@ -75,7 +75,7 @@ def test_check_says_so(tmp_path: Path) -> None:
 def test_teaching_and_calibrating_are_refused(tmp_path: Path) -> None:
     command = Measurement(UR5, tmp_path / "new.yaml", "plane", True)
 
-    def never(session: CalibrationSession) -> Finding:
+    def never(session: CalibrationSession) -> MeasurementResult:
         raise AssertionError("measured")
 
     with pytest.raises(Locked, match="is in use"):

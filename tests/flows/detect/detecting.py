@@ -14,7 +14,7 @@ from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
@@ -28,7 +28,7 @@ MANY = 300
 
 def untrained(seed: int = 0, outputs: int = 4) -> Fitted:
     """A network as it is before training; it spikes, and knows nothing."""
-    network = Network(outputs_per_class=outputs)
+    network = NetworkSettings(outputs_per_class=outputs)
     windows, training = Windows(), Training(epochs=1)
     record = EpochRecord(1, 1.0, 0.3, 1.0, 0.3, 0.3, 0.3, dict.fromkeys(SPIKING, 0.1))
     state = weights(build(network, windows, seed))

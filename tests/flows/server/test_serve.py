@@ -22,7 +22,7 @@ from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.flows.server import deployments, serve
 from sliplab.flows.server.deployments import until_of
-from sliplab.flows.server.schedules import Ask, Chain, Collect, OnRig, Scheduled
+from sliplab.flows.server.schedules import Ask, Collect, OnRig, Scheduled, ScheduledChain
 from sliplab.flows.server.service import Service
 from sliplab.plugins.claims.document import StoppingRecord
 from sliplab.protocols import InputError
@@ -129,7 +129,7 @@ def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> Non
     assert resume(Ask(), return_state=True).type.value == "COMPLETED"
 
     # collected and labelled; and nothing was trained that could be evaluated
-    state = chain(Chain(protocol=protocol, trials=2, train=False), return_state=True)
+    state = chain(ScheduledChain(protocol=protocol, trials=2, train=False), return_state=True)
     assert (state.type.value, "run `sliplab train` first" in state.message) == ("FAILED", True)
     store = Store.open(service.folder)
     labels = Derived.of(store, "labels", campaign.NAME)

@@ -10,8 +10,8 @@ import pytest
 
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.server import deployments
-from sliplab.flows.server.schedules import Study
-from sliplab.flows.study import Outcome
+from sliplab.flows.server.schedules import ScheduledStudy
+from sliplab.flows.study import StudyOutcome
 from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from tests.conftest import ROOT
 
@@ -36,16 +36,16 @@ def test_a_served_study_asks_for_the_same_trials(
 ) -> None:
     asked: list[Any] = []
 
-    def study(run_requests: list[Any], check: int) -> Outcome:
+    def study(run_requests: list[Any], check: int) -> StudyOutcome:
         asked.extend([run_requests, check])
-        return Outcome([{"taken": 3}], [{"step": "report", "done": 1}], [])
+        return StudyOutcome([{"taken": 3}], [{"step": "report", "done": 1}], [])
 
     monkeypatch.setattr("sliplab.flows.study.study", study)
     monkeypatch.setattr(
         deployments, "when_free", lambda _run_request, _patience, work, _run: work()
     )
     here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
-    said = deployments._study(Study(extra=extra), here, None)
+    said = deployments._study(ScheduledStudy(extra=extra), here, None)
     assert said == "3 trials taken; report: 1 done"
     run_requests, check = asked
     assert check == LABELS_CHECKED

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.review.doubt import reasons_for_doubt
 from sliplab.flows.label import report_states
 from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial
@@ -17,7 +17,7 @@ from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from tests.analysis.labels.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
 from tests.storage.formats.files import lab_hdf5
 
@@ -34,11 +34,11 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     trial = made.ids[0]
     made.keys[trial] = "of an older label"
     made.decide(trial, "adjust")
-    labels = Labels(made.store, reviewed=True)
+    labels = StoreLabels(made.store, reviewed=True)
     found = labels.read(made.item, made.recording(trial))
     assert found.incipient_ns == label()["incipient_ns"]
     assert report_states(labels, [made.item])["reviewed"]["stale"] == 1
-    assert report_states(Labels(made.store), [made.item]) == {}
+    assert report_states(StoreLabels(made.store), [made.item]) == {}
     assert (
         "decisions on 1 trial were made on labels that have changed since"
         in capsys.readouterr().err
@@ -114,7 +114,7 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     assert trials.refresh()
     bare = load_trial(made.store, made.item, trials.rows[1])
     assert bare.displacement_px.shape == (60, 0)
-    assert bare.suggested == Onsets()
+    assert bare.suggested == ReviewedOnsets()
 
 
 def test_a_port_that_is_taken_and_a_campaign_that_is_not_there(made: Reviewable) -> None:

@@ -241,7 +241,7 @@ def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> N
     assert made.new.incipient_ns == round(float(reported.removesuffix(" s")) * 1e9)
     assert made.new.gross_ns == known["gross_ns"]  # not moved: to the nanosecond
     made = review.last(served.made.store, NAME, two)
-    assert (made.verdict, made.new) == ("reject", review.Onsets())
+    assert (made.verdict, made.new) == ("reject", review.ReviewedOnsets())
 
 
 @pytest.mark.long
@@ -252,8 +252,13 @@ def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: 
     expect(tab.chosen()).to_contain_text(trial)
     # another program, between this reviewer's look and this reviewer's key
     known = label()
-    onsets = review.Onsets(known["incipient_ns"], known["gross_ns"])
-    known = {"label": served.made.keys[trial], "old": onsets, "new": review.Onsets(), "seen": 0}
+    onsets = review.ReviewedOnsets(known["incipient_ns"], known["gross_ns"])
+    known = {
+        "label": served.made.keys[trial],
+        "old": onsets,
+        "new": review.ReviewedOnsets(),
+        "seen": 0,
+    }
     review.decide(served.made.store, NAME, trial, "reject", **known, who="bert", why="blurred")
     tab.press("a")
     # either the page knew already, and this is a second decision, or it says so

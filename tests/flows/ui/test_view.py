@@ -20,7 +20,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from tests.analysis.labels import reviewable
 from tests.analysis.labels.reviewable import EVENTS, FRAMES, NAME, Reviewable, events, frame_times
 from tests.flows.listening import listening
@@ -33,8 +33,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Reviewable:
     """Two trials; the first is reviewed and evaluated."""
     found = Reviewable(tmp_path_factory.mktemp("view") / "s", 2)
     trial, known = found.ids[0], reviewable.label()
-    old = Onsets(known["incipient_ns"], known["gross_ns"])
-    new = Onsets(310_000_001, 450_000_002)
+    old = ReviewedOnsets(known["incipient_ns"], known["gross_ns"])
+    new = ReviewedOnsets(310_000_001, 450_000_002)
     known = {"label": found.keys[trial], "old": old, "new": new, "seen": 0, "who": "anna"}
     review.decide(found.store, NAME, trial, "adjust", **known)
     counts = {"counts": np.arange(12).reshape(4, 3), "end_ns": np.array([5, 7, 9, 1 << 60])}

@@ -18,7 +18,7 @@ from sliplab.plugins.abb_socket import driver
 from sliplab.plugins.abb_socket.driver import AbbSocketArm
 from sliplab.plugins.abb_socket.fake import FakeRapidServer
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
-from sliplab.plugins.abb_socket.wire import Command, RapidError, RapidSocket
+from sliplab.plugins.abb_socket.wire import RapidError, RapidSocket, ServerCommand
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
@@ -238,7 +238,7 @@ def test_an_answer_that_makes_no_sense_is_an_error(answer: bytes, match: str) ->
             with client:
                 client.sendall(answer)
                 with pytest.raises(RapidError, match=match):
-                    link.ask(Command.POSE, within_s=0.5)
+                    link.ask(ServerCommand.POSE, within_s=0.5)
         finally:
             link.close()
 
@@ -252,11 +252,13 @@ def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
     link = RapidSocket(robot.host, robot.port, 1.0)
     try:
         assert "RAPID socket server" in link.info(1.0)
-        assert len(link.ask(Command.JOINTS, within_s=1.0)) == 6
+        assert len(link.ask(ServerCommand.JOINTS, within_s=1.0)) == 6
         with pytest.raises(RapidError, match="refused MOVE_JOINTS"):
-            link.ask(Command.MOVE_JOINTS, (0.0,) * 6, within_s=1.0)
+            link.ask(ServerCommand.MOVE_JOINTS, (0.0,) * 6, within_s=1.0)
         with pytest.raises(RapidError, match="refused SET_WORK_OBJECT"):
-            link.ask(Command.SET_WORK_OBJECT, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), within_s=1.0)
+            link.ask(
+                ServerCommand.SET_WORK_OBJECT, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), within_s=1.0
+            )
     finally:
         link.close()
     with pytest.raises(ValueError, match="clock back is not simulated"):

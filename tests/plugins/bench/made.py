@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.plugins.bench.alarms import Judged
+from sliplab.plugins.bench.alarms import SceneEvidence
 from sliplab.plugins.bench.document import BenchDetector
 from sliplab.plugins.bench.feeding import feed
 from sliplab.plugins.bench.figures import RATES, tested, validated
@@ -57,8 +57,8 @@ def row_of(
 ) -> BenchDetector:
     """A detector's row, as the bench makes it, without nuisances."""
 
-    def judged(scenes: list[Scene]) -> list[Judged]:
-        return [Judged(feed(detector, one), one.slip, one.world) for one in scenes]
+    def judged(scenes: list[Scene]) -> list[SceneEvidence]:
+        return [SceneEvidence(feed(detector, one), one.slip, one.world) for one in scenes]
 
     detector.train(train, validation)
     levels = validated(judged(validation), RATES)

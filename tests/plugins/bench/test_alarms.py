@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sliplab.plugins.bench.alarms import Judged, alarm_times, level_at, outcome
+from sliplab.plugins.bench.alarms import SceneEvidence, alarm_times, level_at, outcome
 from sliplab.plugins.bench.figures import accuracy, disturbed_rate, scores
 from sliplab.plugins.bench.interface import Evidence, Slip
 
 SLIP = Slip(5_000_000, 5_100_000, 8_000_000)
 
 
-def judged(*pairs: tuple[float, float], slip: Slip = SLIP) -> Judged:
+def judged(*pairs: tuple[float, float], slip: Slip = SLIP) -> SceneEvidence:
     """Evidence of (seconds, value)."""
     t_s, value = zip(*pairs, strict=True)
-    return Judged(Evidence.of(np.round(1e6 * np.array(t_s)), value), slip)
+    return SceneEvidence(Evidence.of(np.round(1e6 * np.array(t_s)), value), slip)
 
 
 def test_an_alarm_lasts_a_second() -> None:
@@ -68,7 +68,7 @@ def test_a_median_with_half_of_the_slips_missed_is_infinite() -> None:
     assert found.latency_ms.high is None, "a missed one is among the ranks"
 
 
-def in_world(world: str, *at_s: float) -> Judged:
+def in_world(world: str, *at_s: float) -> SceneEvidence:
     """A scene whose evidence exceeds 1 at these times, s, and 1.2 s after the slip began."""
     return replace(judged(*((t, 9.0) for t in (*at_s, 6.2))), world=world)
 
@@ -112,7 +112,7 @@ def test_accuracy_weighs_classes_and_not_windows() -> None:
     middle = t_us - 15_000
     true = (middle >= SLIP.paper_us).astype(int) + (middle >= SLIP.gross_us)
     values = np.zeros(len(t_us))
-    assert accuracy([Judged(Evidence.of(t_us, values, true), SLIP)]) == 1.0
-    never = Judged(Evidence.of(t_us, values, np.zeros(len(t_us))), SLIP)
+    assert accuracy([SceneEvidence(Evidence.of(t_us, values, true), SLIP)]) == 1.0
+    never = SceneEvidence(Evidence.of(t_us, values, np.zeros(len(t_us))), SLIP)
     assert accuracy([never]) == pytest.approx(1 / 3)
-    assert accuracy([Judged(Evidence.of(t_us, values), SLIP)]) is None
+    assert accuracy([SceneEvidence(Evidence.of(t_us, values), SLIP)]) is None

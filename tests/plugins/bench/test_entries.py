@@ -15,9 +15,9 @@ from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import INCIPIENT
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.entries.hyperdimensional import Hyperdimensional
-from sliplab.plugins.bench.entries.network import Paper
+from sliplab.plugins.bench.entries.network import PaperEntry
 from sliplab.plugins.bench.entries.onnx_model import OnnxModel
-from sliplab.plugins.bench.entries.program import ANSWER, MOST, Program
+from sliplab.plugins.bench.entries.program import ANSWER, MOST, ExternalProcess
 from sliplab.plugins.bench.entries.thresholds import Fall, motions
 from sliplab.plugins.bench.entries.trivial import Random
 from sliplab.plugins.bench.feeding import BenchError, audit, feed
@@ -42,7 +42,7 @@ def program(folder: Path, text: str) -> str:
 
 
 def test_a_program_gives_the_evidence_of_the_same_detector_in_python(one: Scene) -> None:
-    detector = Program(f"{sys.executable} {ROOT / 'examples/bench/rate.py'}")
+    detector = ExternalProcess(f"{sys.executable} {ROOT / 'examples/bench/rate.py'}")
     try:
         for _ in range(2):  # a scene does not depend on the one before
             expected, found = feed(Counting(), one), feed(detector, one)
@@ -68,7 +68,7 @@ def test_a_program_that_fails_is_ended_and_says_why(
     text: str, said: str, one: Scene, tmp_path: Path
 ) -> None:
     answer_s = 0.5 if "sleep" in text else 30.0  # it takes a while to start
-    detector = Program(program(tmp_path, text), answer_s=answer_s, end_s=0.5)
+    detector = ExternalProcess(program(tmp_path, text), answer_s=answer_s, end_s=0.5)
     with pytest.raises(BenchError, match=said):
         feed(detector, one)
     detector.close()
@@ -77,7 +77,7 @@ def test_a_program_that_fails_is_ended_and_says_why(
 
 def test_a_program_that_writes_before_it_reads_blocks_nobody(one: Scene, tmp_path: Path) -> None:
     text = "import sys; sys.stdout.buffer.write(bytes(10**6)); sys.stdout.flush(); sys.stdin.read()"
-    detector = Program(program(tmp_path, text), answer_s=30.0, end_s=0.5)
+    detector = ExternalProcess(program(tmp_path, text), answer_s=30.0, end_s=0.5)
     with pytest.raises(BenchError, match="answered"):
         feed(detector, one)
     detector.close()
@@ -101,7 +101,7 @@ def test_a_program_whose_evidence_is_no_number_is_refused(
     value: str, one: Scene, tmp_path: Path
 ) -> None:
     text = ANSWERS.format(before="", value=value)
-    detector = Program(program(tmp_path, text), answer_s=30.0)
+    detector = ExternalProcess(program(tmp_path, text), answer_s=30.0)
     with pytest.raises(BenchError, match="must be finite or -inf"):
         feed(detector, one)
     detector.close()
@@ -115,7 +115,9 @@ def test_children_of_a_program_end_with_it(own_session: bool, one: Scene, tmp_pa
         f"start_new_session={own_session})\n"
         f"open({str(pids)!r}, 'w').write(str(child.pid))"
     )
-    detector = Program(program(tmp_path, ANSWERS.format(before=before, value="1.0")), 30.0, 5.0)
+    detector = ExternalProcess(
+        program(tmp_path, ANSWERS.format(before=before, value="1.0")), 30.0, 5.0
+    )
     feed(detector, one)
     child = int(pids.read_text())
     os.kill(child, 0)
@@ -144,7 +146,7 @@ def alive(pid: int) -> bool:
 def test_a_program_that_floods_its_output_is_bounded(
     text: str, said: str, one: Scene, tmp_path: Path
 ) -> None:
-    detector = Program(program(tmp_path, text), answer_s=2.0, end_s=0.2)
+    detector = ExternalProcess(program(tmp_path, text), answer_s=2.0, end_s=0.2)
     with pytest.raises(BenchError, match=said):
         feed(detector, one)
     assert len(detector._read) <= MOST * ANSWER.itemsize + (1 << 17)
@@ -300,7 +302,7 @@ def test_hyperdimensional_prototypes_have_384_bytes_and_tell_scenes_apart() -> N
 
 
 def test_the_papers_entry_speaks_where_the_published_rule_does() -> None:
-    paper = Paper()
+    paper = PaperEntry()
     rule = paper.settings.detection
     assert (rule.smoothing, rule.margin) == (4, 2.0)
     counts = np.random.default_rng(5).integers(0, 12, (300, 3))

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from sliplab.plugins.bench import run, scenes
-from sliplab.plugins.bench.definition import SIZES, Part, Size
+from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
 from sliplab.plugins.bench.document import BenchResult
-from sliplab.plugins.bench.entries.thresholds import Rate
+from sliplab.plugins.bench.entries.thresholds import EventRate
 from sliplab.plugins.bench.interface import Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
 from tests.command_line import here
 
-TINY = Size(Part(1, 2, 0), Part(1, 3, 0), Part(2, 2, 0), 1)
+TINY = Size(ScenePart(1, 2, 0), ScenePart(1, 3, 0), ScenePart(2, 2, 0), 1)
 NAMES = ("rate", "always", "random")
 
 
@@ -57,7 +57,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
     done: list[str] = []
     simulated, validated = scenes.simulated, run.validated
 
-    def simulate(drawn: scenes.Drawn) -> Scene:
+    def simulate(drawn: scenes.SceneDraw) -> Scene:
         done.append(drawn.name.split()[0])
         return simulated(drawn)
 
@@ -77,10 +77,10 @@ def test_a_detector_is_trained_on_training_and_validation_scenes(
 ) -> None:
     seen: list[list[str]] = []
 
-    def train(self: Rate, given: Sequence[Scene], validation: Sequence[Scene]) -> None:
+    def train(self: EventRate, given: Sequence[Scene], validation: Sequence[Scene]) -> None:
         seen.extend([one.name for one in part] for part in (given, validation))
 
-    monkeypatch.setattr(Rate, "train", train)
+    monkeypatch.setattr(EventRate, "train", train)
     run.run_bench(["rate"], "small", 1, tmp_path)
     assert seen == [
         ["train 1.1", "train 1.2"],
@@ -91,11 +91,11 @@ def test_a_detector_is_trained_on_training_and_validation_scenes(
 def test_a_stopped_run_resumes_with_the_next_detector(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def stopped(self: Rate, *_: object) -> None:
+    def stopped(self: EventRate, *_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Rate, "train", stopped)
+        patch.setattr(EventRate, "train", stopped)
         with pytest.raises(KeyboardInterrupt):
             run.run_bench(["always", "rate", "never"], "small", 1, tmp_path)
     trained: list[str] = []
@@ -185,6 +185,6 @@ def test_wrong_input_is_said_before_anything_is_simulated(
 def test_a_detector_that_breaks_the_rules_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(Rate, "push", lambda *_: 3)
+    monkeypatch.setattr(EventRate, "push", lambda *_: 3)
     with pytest.raises(InputError, match=r"DETECTOR = rate: .*: push returned int"):
         run.run_bench(["rate"], "small", 1, tmp_path)

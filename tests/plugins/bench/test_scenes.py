@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from sliplab.plugins.bench import definition, scenes
-from sliplab.plugins.bench.definition import SIZES, Part, Size
+from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
 from sliplab.plugins.bench.interface import Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.hashing import hash_data
 
-SIZE = Size(Part(2, 2, 0), Part(1, 2, 1), Part(2, 2, 1), 1)
+SIZE = Size(ScenePart(2, 2, 0), ScenePart(1, 2, 1), ScenePart(2, 2, 1), 1)
 
 
 def test_version_1_is_frozen() -> None:
@@ -47,7 +47,7 @@ def test_a_seed_draws_the_test_worlds_and_nothing_else() -> None:
 
 
 def test_a_larger_set_begins_with_the_worlds_of_a_smaller_one() -> None:
-    more = dataclasses.replace(SIZE, train=Part(3, 3, 0))
+    more = dataclasses.replace(SIZE, train=ScenePart(3, 3, 0))
     few, many = scenes.training_scenes(SIZE)[0], scenes.training_scenes(more)[0]
     assert [drawn for drawn in many if drawn.name in {it.name for it in few}] == few
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from sliplab.plugins.claims.blocks import Estimate, block_share, of_trials
+from sliplab.plugins.claims.blocks import MeanEstimate, block_share, of_trials
 
 F = Callable[[np.random.Generator], np.ndarray]
 CASES: dict[str, F] = {
@@ -29,7 +29,7 @@ def _autoregressive(rng: np.random.Generator, count: int, rho: float) -> np.ndar
     return np.array(found)
 
 
-def of(blocks: np.ndarray) -> Estimate:
+def of(blocks: np.ndarray) -> MeanEstimate:
     """The estimate that is the mean of blocks."""
     count = len(blocks)
     return of_trials(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sliplab.plugins.claims.choosing import next_batch, spread_out
-from sliplab.plugins.claims.document import Batch, ClaimState
-from sliplab.plugins.claims.evidence import Evidence, Grid, chosen_estimate
+from sliplab.plugins.claims.document import ClaimState, TrialBatch
+from sliplab.plugins.claims.evidence import ClaimEvidence, TrialGrid, chosen_estimate
 from sliplab.plugins.claims.shown import count_text, verdict_text
 from sliplab.plugins.claims.simulated import course
 from sliplab.plugins.claims.states import settled, states
@@ -37,7 +37,7 @@ def plan_of(
     return make_plan(validate(Protocol, data, Path("p.yaml")), "p.yaml")
 
 
-def world(grid: Grid, seed: int, noise: float = 100.0) -> np.ndarray:
+def world(grid: TrialGrid, seed: int, noise: float = 100.0) -> np.ndarray:
     """Figures of every trial: effects of depth and speed, and scatter; ms."""
     rng = np.random.default_rng(seed)
     effects = [rng.normal(0, 400, 3), rng.normal(0, 400, 3), rng.normal(0, 50, 4)]
@@ -47,24 +47,24 @@ def world(grid: Grid, seed: int, noise: float = 100.0) -> np.ndarray:
 
 def shuffled(plan: Plan, y: np.ndarray) -> Iterator[tuple[ClaimState, ...]]:
     """The claims after each block."""
-    grid, stopping = Grid.of(plan), plan.protocol.collection.stopping
+    grid, stopping = TrialGrid.of(plan), plan.protocol.collection.stopping
     assert stopping is not None
     ends = np.arange(36, len(y) + 1, 36)
     found: tuple[ClaimState, ...] = ()
-    whole = Evidence(grid, np.arange(len(y)), ends, {"slip_duration": y}, block=stopping.block)
+    whole = ClaimEvidence(grid, np.arange(len(y)), ends, {"slip_duration": y}, block=stopping.block)
     for k in range(len(ends)):
         found = states(whole.until(k), stopping, earlier=found)
         yield found
 
 
-def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[Evidence, tuple[ClaimState, ...]]]:
+def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[ClaimEvidence, tuple[ClaimState, ...]]]:
     """The evidence and the claims after each batch."""
-    grid, collection = Grid.of(plan), plan.protocol.collection
+    grid, collection = TrialGrid.of(plan), plan.protocol.collection
     stopping, choice = collection.stopping, collection.adaptive
     assert stopping is not None
     assert choice is not None
-    batches: list[Batch] = []
-    evidence = Evidence(
+    batches: list[TrialBatch] = []
+    evidence = ClaimEvidence(
         grid,
         np.array([], np.int64),
         np.array([], np.int64),
@@ -76,7 +76,7 @@ def adaptive(plan: Plan, y: np.ndarray) -> Iterator[tuple[Evidence, tuple[ClaimS
         items = [(item, each) for each in batches for item in each.trials]
         taken = np.array([grid.number[item.trial] for item, _ in items])
         chance = [np.nan if item.chance is None else item.chance for item, _ in items]
-        evidence = Evidence(
+        evidence = ClaimEvidence(
             grid,
             taken,
             np.cumsum([len(each.trials) for each in batches]),
@@ -97,7 +97,7 @@ def test_a_claim_of_each_kind_is_settled_as_it_is() -> None:
         {"figure": "slip_duration", "between": between, "at_most": "-300 ms"},
         repetitions=36,
     )
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     depth = np.array([float(dict(t.condition)["depth"]) for t in grid.trials])  # type: ignore[arg-type]
     y = 3000.0 + 600.0 * (depth == 2.4) + np.random.default_rng(1).normal(0, 50, len(depth))
     *_, last = shuffled(plan, y)
@@ -139,7 +139,7 @@ def test_missing_figures_count_against_a_claim() -> None:
     """A third of the conditions is bad, and mostly has no label: the claim is false."""
     claim = {"figure": "slip_duration", "statistic": "p25", "at_least": "2500 ms"}
     plan = plan_of(claim, repetitions=24)
-    grid, rng = Grid.of(plan), np.random.default_rng(4)
+    grid, rng = TrialGrid.of(plan), np.random.default_rng(4)
     bad = grid.levels[:, 0] == 0
     y = np.where(bad, 2000.0, 3200.0) + rng.normal(0, 100, len(bad))
     y[bad & (rng.random(len(y)) < 0.9)] = np.nan
@@ -187,7 +187,7 @@ def test_open_claim_with_interval_beyond_its_bound_says_why() -> None:
 @pytest.mark.parametrize(("kind", "verdict"), [("at_most", "holds"), ("at_least", "refuted")])
 def test_open_claim_that_its_trend_would_undo_says_so(kind: str, verdict: str) -> None:
     plan = plan_of({"figure": "slip_duration", kind: "3000 ms"}, repetitions=24)
-    y = world(Grid.of(plan), 1) + np.linspace(-600, 600, 36 * 24)
+    y = world(TrialGrid.of(plan), 1) + np.linspace(-600, 600, 36 * 24)
     (found,) = next(states for states in shuffled(plan, y) if states[0].blocks == 7)
     assert (found.holds, found.refuted, found.trend) == (False, False, verdict)
     text = f"open: {verdict} only if the trend so far does not continue to the end"
@@ -206,7 +206,7 @@ def test_blocks_of_some_trials_are_stated_by_the_protocol() -> None:
 @pytest.mark.parametrize("between_blocks", [0.0, 25.0, 100.0])
 def test_claims_that_are_just_false_are_seldom_called_true(between_blocks: float) -> None:
     plan = plan_of({"figure": "slip_duration", "at_least": "3000 ms"}, repetitions=12)
-    grid, rng, called = Grid.of(plan), np.random.default_rng(11), 0
+    grid, rng, called = TrialGrid.of(plan), np.random.default_rng(11), 0
     block = np.array([trial.repetition for trial in grid.trials]) - 1
     for _ in range(100):
         y = 3000.0 - 1e-6 + rng.normal(0, 100, 432) + rng.normal(0, between_blocks, 12)[block]
@@ -218,7 +218,7 @@ def test_claims_that_are_just_false_are_seldom_called_true(between_blocks: float
 def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
     # the mean of the corrected estimates over many draws is the grid's, with wrong expectations
     plan = plan_of(WITHIN, order="adaptive")
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     rng = np.random.default_rng(2)
     y = (rng.random(len(grid.trials)) < 0.3).astype(float)
     expected = rng.random(len(grid.trials))
@@ -228,7 +228,7 @@ def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
     members = np.ones(len(y), np.bool_)
     for _ in range(4000):
         k = int(rng.choice(len(y), p=chance))
-        one = Evidence(grid, np.array([k]), np.array([1]), {}, chance[[k]])
+        one = ClaimEvidence(grid, np.array([k]), np.array([1]), {}, chance[[k]])
         found.append(chosen_estimate(one, y[[k]], members, expected[None], expected).value)
     error = np.std(found) / np.sqrt(len(found))
     assert abs(np.mean(found) - y.mean()) < 4 * error
@@ -237,11 +237,11 @@ def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
 def test_adaptive_campaigns_are_right_and_take_fewer_trials() -> None:
     chosen = plan_of(WITHIN, order="adaptive", choice={"batch": 12, "start": 24})
     blocks = plan_of(WITHIN)
-    order = {trial.id: k for k, trial in enumerate(Grid.of(chosen).trials)}
-    same = [order[trial.id] for trial in Grid.of(blocks).trials]
+    order = {trial.id: k for k, trial in enumerate(TrialGrid.of(chosen).trials)}
+    same = [order[trial.id] for trial in TrialGrid.of(blocks).trials]
     needed, by_blocks = [], []
     for seed in range(4):
-        y = world(Grid.of(chosen), seed, 400.0)
+        y = world(TrialGrid.of(chosen), seed, 400.0)
         evidence, found = next(each for each in adaptive(chosen, y) if settled(each[1]))
         low, high = found[0].low, found[0].high
         assert low is not None
@@ -255,14 +255,14 @@ def test_adaptive_campaigns_are_right_and_take_fewer_trials() -> None:
 
 def test_the_same_evidence_chooses_the_same_trials_once_each() -> None:
     plan = plan_of(WITHIN, repetitions=2, order="adaptive", choice={"batch": 10, "start": 10})
-    y = world(Grid.of(plan), 4)
+    y = world(TrialGrid.of(plan), 4)
     (*_, (first, _)), (*_, (second, _)) = adaptive(plan, y), adaptive(plan, y)
     assert first.taken.tolist() == second.taken.tolist()
     assert sorted(first.taken.tolist()) == list(range(72))  # all of the grid in the end
 
 
 def test_the_start_spreads_over_the_grid() -> None:
-    grid = Grid.of(plan_of(WITHIN))
+    grid = TrialGrid.of(plan_of(WITHIN))
     found = spread_out(grid, np.arange(len(grid.trials)), 12, np.random.default_rng(0))
     assert len(set(found)) == 12
     assert [len(set(grid.levels[found, k])) for k in range(3)] == [3, 3, 4]
@@ -273,7 +273,7 @@ def test_trials_that_tell_of_an_open_claim_are_taken_more_often() -> None:
     between = {"factor": "depth", "levels": [2.4, 3.4]}
     claim = {"figure": "slip_duration", "between": between, "within": "1 ms"}
     plan = plan_of(claim, order="adaptive", choice={"batch": 12, "start": 12, "random": 0.2})
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     y = world(grid, 0)
     at = [k for k, _ in zip(range(8), adaptive(plan, y), strict=False)]
     assert len(at) == 8

@@ -31,7 +31,7 @@ from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
 from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
 from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.plugins.deploy.speck import CORES, KI, speck_fit
-from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import NetworkSettings, Training, Windows
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 onnx = pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
 
 
-def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> Fitted:
+def fitted(network: NetworkSettings = SMALL, windows: Windows = TINY, seed: int = 0) -> Fitted:
     record = EpochRecord(1, 1.0, 0.3, 1.0, 0.3, 0.3, 0.3, dict.fromkeys(SPIKING, 0.1))
     state = weights(biased(build(network, windows, seed), seed))
     return Fitted(state, network, windows, Training(epochs=1), seed, (record,), 1, ())
@@ -51,14 +51,14 @@ def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> 
 @pytest.mark.parametrize(
     ("network", "windows"),
     [
-        (Network(), FULL),
+        (NetworkSettings(), FULL),
         (SMALL, TINY),
-        (Network(conv1_kernel=3, conv2_kernel=5, hidden=5), TINY),
-        (Network(biases=False, outputs_per_class=1), TINY),
+        (NetworkSettings(conv1_kernel=3, conv2_kernel=5, hidden=5), TINY),
+        (NetworkSettings(biases=False, outputs_per_class=1), TINY),
         (SMALL, Windows(length_ms=8, step_ms=2, crop_px=100, pool_px=20, polarity="both")),
     ],
 )
-def test_the_graph_counts_as_sinabs_does(network: Network, windows: Windows) -> None:
+def test_the_graph_counts_as_sinabs_does(network: NetworkSettings, windows: Windows) -> None:
     net = biased(build(network, windows, 1), 1)
     x = sparse(20, windows, 1, 0.1)
     data = to_onnx(net, windows, {"classes": "a"})
@@ -98,7 +98,7 @@ def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:
 
 
 def test_the_default_network_fits_a_speck() -> None:
-    fit = speck_fit(Network(), Windows())
+    fit = speck_fit(NetworkSettings(), Windows())
     assert fit.problems == ()
     assert fit.fits
     assert sorted(fit.cores) == sorted(WEIGHTED)
@@ -114,13 +114,13 @@ def test_the_default_network_fits_a_speck() -> None:
 @pytest.mark.parametrize(
     ("network", "windows", "said"),
     [
-        (Network(hidden=64), Windows(), "fc1: needs 128 Ki of kernel memory"),
-        (Network(hidden=33), Windows(), "fc1: needs 128 Ki of kernel memory"),
-        (Network(conv1_channels=128), Windows(), "conv1: needs .* 128 Ki of neuron memory"),
-        (Network(), Windows(pool_px=10), "fc1: kernel is 20, at most 16"),
+        (NetworkSettings(hidden=64), Windows(), "fc1: needs 128 Ki of kernel memory"),
+        (NetworkSettings(hidden=33), Windows(), "fc1: needs 128 Ki of kernel memory"),
+        (NetworkSettings(conv1_channels=128), Windows(), "conv1: needs .* 128 Ki of neuron memory"),
+        (NetworkSettings(), Windows(pool_px=10), "fc1: kernel is 20, at most 16"),
     ],
 )
-def test_what_does_not_fit_is_said(network: Network, windows: Windows, said: str) -> None:
+def test_what_does_not_fit_is_said(network: NetworkSettings, windows: Windows, said: str) -> None:
     fit = speck_fit(network, windows)
     assert not fit.fits
     assert fit.cores == {}
@@ -140,7 +140,7 @@ def test_memories_are_those_that_sinabs_reckons(
     conv1: int, conv2: int, hidden: int, kernel1: Any, kernel2: Any, cells: int
 ) -> None:
     """Sinabs' own check, on sides where the half pixel that it leaves in does not matter."""
-    network = Network(
+    network = NetworkSettings(
         conv1_channels=conv1,
         conv2_channels=conv2,
         hidden=hidden,
@@ -169,7 +169,7 @@ def test_memories_are_those_that_sinabs_reckons(
 
 
 def test_weights_and_threshold_are_whole_and_in_range() -> None:
-    net = biased(build(Network(), FULL, 3), 3)
+    net = biased(build(NetworkSettings(), FULL, 3), 3)
     found = quantise(net)
     for name, spiking in zip(WEIGHTED, SPIKING, strict=True):
         parts = {k: w for k, w in found.weights.items() if k.startswith(name)}
@@ -185,7 +185,7 @@ def test_weights_and_threshold_are_whole_and_in_range() -> None:
 
 
 def test_the_chips_arithmetic_is_the_networks_in_whole_numbers() -> None:
-    one = fitted(Network(), FULL, 3)
+    one = fitted(NetworkSettings(), FULL, 3)
     whole = quantised_net(one, quantise(restore(one)))
     x = sparse(24, FULL, 3, 0.03)
     ran = chip_run(whole, x)

@@ -16,7 +16,7 @@ from sliplab.plugins.driver_kit import (
 from sliplab.plugins.driver_kit.arm_bench import ArmBench
 from sliplab.plugins.driver_kit.conformance import cases, conformance
 from sliplab.plugins.driver_kit.examples import arm, events, frames
-from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, Seen
+from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, RuleViolation
 from sliplab.plugins.driver_kit.rule_tables import rule_tables
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import FrameCameraDriver
@@ -85,7 +85,7 @@ def test_a_fault_that_the_driver_made_up_names_the_call() -> None:
 def test_another_exception_than_a_rig_error_is_a_finding() -> None:
     with (
         ArmBench(arm.DRIVER, arm_settings(), Bounds()) as bench,
-        pytest.raises(Seen, match=r"stop raised ZeroDivisionError.*which is no RigError"),
+        pytest.raises(RuleViolation, match=r"stop raised ZeroDivisionError.*which is no RigError"),
     ):
         bench.call("stop", lambda: 1 // 0)
 
@@ -120,4 +120,4 @@ def test_a_failure_in_pytest_is_the_message_alone(monkeypatch: pytest.MonkeyPatc
 
 
 def _dances(bench: ArmBench) -> None:
-    raise Seen("the arm danced")
+    raise RuleViolation("the arm danced")

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from sliplab.plugins.driver_kit import arm_rules, motion_rules, stream_rules
 from sliplab.plugins.driver_kit.arm_bench import ArmBench
-from sliplab.plugins.driver_kit.bench import POLL_S, Bench, check_methods
+from sliplab.plugins.driver_kit.bench import POLL_S, DeviceBench, check_methods
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried
 from sliplab.plugins.driver_kit.sensor_benches import SyncBench
 from sliplab.plugins.driver_kit.stream_bench import BATCHES, StreamBench
-from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import (
     Arm,
     ArmState,
@@ -30,8 +30,8 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import ForceSensor as ForceSettings
-from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
+from sliplab.rigs.mock.settings import MockForceSensorSettings as ForceSettings
+from sliplab.rigs.mock.settings import MockFrameCameraSettings as FrameSettings
 from sliplab.rigs.mock.settings import MockSettings
 
 SETTINGS = MockSettings(
@@ -59,7 +59,7 @@ TIMED = {"frames", "force"}
 """Devices whose chunks have the host's time of reception."""
 
 
-class OnVirtualClock(Bench):
+class OnVirtualClock(DeviceBench):
     """A bench whose time passes in a simulated world only."""
 
     devices: MockDevices
@@ -83,14 +83,14 @@ class MockArmBench(OnVirtualClock, ArmBench):
     """The simulated arm, clear of the plate; it turns about the plate's normal alone."""
 
     def __init__(self) -> None:
-        Bench.__init__(self, Bounds())
+        DeviceBench.__init__(self, Bounds())
         self.devices = build_mock(SETTINGS)
         self.arm = self.devices.arm
         self.home = self.devices.arm.pose()
         tool = Rotation.from_rotvec(self.home.rotvec_deg, degrees=True)
         self.axis = tuple(tool.apply([0.0, 0.0, 1.0]))
         low, high = ([value + step for value in self.home.xyz_mm] for step in (-20.0, 20.0))
-        self.limits = Limits.model_validate({"low_mm": low, "high_mm": high})
+        self.limits = ArmLimits.model_validate({"low_mm": low, "high_mm": high})
 
     def place(self) -> Pose:
         return self.devices.arm.pose()
@@ -121,7 +121,7 @@ class MockStreamBench(OnVirtualClock, StreamBench):
     """A simulated device that streams."""
 
     def __init__(self, name: str) -> None:
-        Bench.__init__(self, Bounds())
+        DeviceBench.__init__(self, Bounds())
         self.devices = build_mock(SETTINGS)
         self.device: Any = getattr(self.devices, name)
         self.clock_field = "t_us" if name == "events" else "t_ns"

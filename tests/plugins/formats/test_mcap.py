@@ -29,7 +29,7 @@ from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.schema.trial import Clocks, Provenance, SyncResult
+from sliplab.storage.schema.trial import Provenance, SyncResult, TrialClockMaps
 from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
@@ -70,7 +70,9 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
     clocks = one.record.clocks.to_json()
     arm = clocks["arm"]["map"]
     arm["reference_ns"] = [t_ns + 1000 for t_ns in arm["reference_ns"]]
-    refitted = SyncResult(key="new", raw=one.raw_checksum, clocks=Clocks.model_validate(clocks))
+    refitted = SyncResult(
+        key="new", raw=one.raw_checksum, clocks=TrialClockMaps.model_validate(clocks)
+    )
     Derived.of(store, SYNC, where.name).write(one.folder.name, "new", refitted)
     one.forget_clocks()
     assert one.refitted
@@ -506,16 +508,16 @@ def _with(where: Store, path: Path, change: Any) -> None:
 def test_columns_that_no_trial_has_are_refused(
     name: str, change: dict[str, Any], says: str, rich: Store, tmp_path: Path
 ) -> None:
-    real = ros2.Rows.message
+    real = ros2.RowsMessage.message
 
-    def changed(self: ros2.Rows, t_ns: int) -> bytes:
+    def changed(self: ros2.RowsMessage, t_ns: int) -> bytes:
         if self.column in {"poses/t", "frames/number"}:
             facts = {key: edit(getattr(self, key)) for key, edit in change.items()}
-            self = ros2.Rows(**{**vars(self), **facts})
+            self = ros2.RowsMessage(**{**vars(self), **facts})
         return real(self, t_ns)
 
     path = tmp_path / "t.mcap"
-    _with(rich, path, lambda patch: patch.setattr(ros2.Rows, "message", changed))
+    _with(rich, path, lambda patch: patch.setattr(ros2.RowsMessage, "message", changed))
     made = Store.create(tmp_path / "store")
     with pytest.raises(InputError, match=says):
         take(made, path, "c")

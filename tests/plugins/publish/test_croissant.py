@@ -14,7 +14,7 @@ import pytest
 from rocrate.rocrate import ROCrate
 
 from sliplab.plugins.publish.forms import publish
-from sliplab.plugins.publish.publication import About, Publication
+from sliplab.plugins.publish.publication import Publication, PublicationInfo
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.export_trials import label_table
 from sliplab.storage.formats.import_trials import import_trials
@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated"),
     pytest.mark.filterwarnings("ignore:The inplace keyword in DataFrame.reset_index"),
 ]
-ABOUT = About("Four slides", ("A. Author", "B. Author"), "CC-BY-4.0", "2026-11-24")
+ABOUT = PublicationInfo("Four slides", ("A. Author", "B. Author"), "CC-BY-4.0", "2026-11-24")
 
 
 def publication(store: Store, **changes: Any) -> Publication:
@@ -159,7 +159,7 @@ def test_a_real_campaign_with_a_video_without_labels(tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer)
     writer.commit(record("t", simulated=False), Provenance(host="test", operator="somebody"))
-    about = About("One | trial", (), None, "2026-11-24")
+    about = PublicationInfo("One | trial", (), None, "2026-11-24")
     output = tmp_path / "deep" / "out"
     publish(
         publication(Store.open(tmp_path / "store"), about=about, splits={}), output, "croissant"
@@ -231,12 +231,12 @@ def test_what_cannot_be_published_is_said_and_changes_nothing(tmp_path: Path) ->
 )
 def test_wrong_facts_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        About(**{**vars(ABOUT), **changes})
+        PublicationInfo(**{**vars(ABOUT), **changes})
 
 
 def test_a_licence_of_ones_own_has_a_name_and_no_address(tmp_path: Path) -> None:
     commit(campaign(tmp_path / "store"), "t")
-    about = About("T", (), "LicenseRef-Lab", "2026-11-24")
+    about = PublicationInfo("T", (), "LicenseRef-Lab", "2026-11-24")
     output = tmp_path / "out"
     publish(publication(Store.open(tmp_path / "store"), about=about), output, "croissant")
     assert json.loads((output / "croissant.json").read_text())["license"] == "LicenseRef-Lab"

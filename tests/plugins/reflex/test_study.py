@@ -14,7 +14,7 @@ from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.live import counting_of
 from sliplab.analysis.study import Finding
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.reflex import flow
 from sliplab.plugins.reflex.rows import reflex_rows
 from sliplab.plugins.reflex.study import STUDY
@@ -95,7 +95,7 @@ def test_what_was_done_is_kept_and_not_done_again(
 
 
 def test_a_store_has_all_its_detectors(
-    ran: tuple[list[RunRequest], Outcome], fast: Path, tmp_path: Path
+    ran: tuple[list[RunRequest], StudyOutcome], fast: Path, tmp_path: Path
 ) -> None:
     """Each at its level and stride; one reacts in a trial, and another one's name is refused."""
     place = ran[0][0].store
@@ -117,7 +117,7 @@ def test_a_store_has_all_its_detectors(
 
 
 def test_a_store_detects_by_any_of_its_detectors(
-    ran: tuple[list[RunRequest], Outcome], fast: Path
+    ran: tuple[list[RunRequest], StudyOutcome], fast: Path
 ) -> None:
     place = ran[0][0].store
     asked = ("detect", "--rig", RIG, "--protocol", fast, "--trial", "speed=4mmps", "--json")

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.analysis.evaluation import baselines as window_baselines
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome, searches, study, study_plan
+from sliplab.flows.study import StudyOutcome, searches, study, study_plan
 from sliplab.plugins.studies import searches as planned_searches
 from sliplab.plugins.studies.detector.grid import Axes
 from sliplab.plugins.studies.detector.search import SearchSize
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.programs
 NAMES = ["baselines", "generalisation", "detector search"]
 
 
-def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
+def test_what_a_study_can_have(ran: tuple[list[RunRequest], StudyOutcome]) -> None:
     slides, falls = ran[0]
     assert [each.name for each in searches([slides, falls])] == NAMES
     real = slides.rig.model_copy(update={"driver": "devices"})
@@ -42,7 +42,7 @@ def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
 
 
 def test_they_stand_before_the_report_with_their_own_time(
-    ran: tuple[list[RunRequest], Outcome],
+    ran: tuple[list[RunRequest], StudyOutcome],
 ) -> None:
     run_requests, _ = ran
     planned = study_plan(run_requests)
@@ -53,7 +53,7 @@ def test_they_stand_before_the_report_with_their_own_time(
 
 @pytest.mark.long
 def test_each_is_done_once_and_reported(
-    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], StudyOutcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(ran[0][0].store, tmp_path / "store")
     run_requests = [replace(run_request, store=tmp_path / "store") for run_request in ran[0]]

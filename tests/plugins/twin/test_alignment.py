@@ -26,7 +26,7 @@ from sliplab.plugins.twin.contact_estimates import read_contact
 from sliplab.plugins.twin.contact_slips import find_slips
 from sliplab.plugins.twin.document import MisfitCheck
 from sliplab.plugins.twin.misfits import misfits
-from sliplab.plugins.twin.pilot import Camera, Forces, PilotTrial
+from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents
 from sliplab.plugins.twin.trends import LAG, PULL, RATIO, contact_trends, plain_trend, trend
 from sliplab.storage.streams import F64, EventChunk
 from tests.plugins.twin.test_camera_estimates import pilot as seen_by_events
@@ -301,7 +301,7 @@ def test_frames_that_are_late_against_events_have_their_delay(seconds: float) ->
             np.ones(len(t), np.int8),
             np.round(1e6 * t[order]).astype(np.int64),
         )
-        made.append(replace(trial, camera=Camera(events, (400, 400))))
+        made.append(replace(trial, camera=SlideEvents(events, (400, 400))))
     found = event_delay_ms(late(made, seconds), rests)
     assert found == pytest.approx(-1e3 * seconds, abs=2.0)
     assert np.isnan(event_delay_ms(drawn(), rests))

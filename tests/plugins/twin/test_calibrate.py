@@ -29,9 +29,9 @@ from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file
 from sliplab.plugins.twin.misfits import CHECKS
 from sliplab.plugins.twin.parameters import PARAMETERS, value_of
 from sliplab.plugins.twin.pilot import pilot_trial, slide_of
-from sliplab.plugins.twin.pilots import Pilot, read_pilot, simulate_pilot
+from sliplab.plugins.twin.pilots import PilotSlides, read_pilot, simulate_pilot
 from sliplab.plugins.twin.shown import SameTrials
-from sliplab.plugins.twin.statistics import Statistics
+from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
@@ -54,12 +54,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store(folder)
 
 
-def requested(tmp_path: Path, **changes: Any) -> calibrate.Calibration:
+def requested(tmp_path: Path, **changes: Any) -> calibrate.FitRequest:
     wanted = {"worlds": 100, "spread": 0.5, "seed": 1} | changes
     return calibrate.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
 
 
-def fitted(store: Store, item: Collected, wanted: calibrate.Calibration) -> TwinFit:
+def fitted(store: Store, item: Collected, wanted: calibrate.FitRequest) -> TwinFit:
     """Fit a twin, and write all its files."""
     fit, trials = calibrate.calibrate_scene(store, item, wanted)
     STUDY.write(finding(wanted.out, fit, trials))
@@ -67,15 +67,15 @@ def fitted(store: Store, item: Collected, wanted: calibrate.Calibration) -> Twin
 
 
 def answering(
-    wanted: calibrate.Calibration, observed: dict[str, float], effects: Mapping[str, float]
-) -> Callable[[worlds.World], Statistics]:
+    wanted: calibrate.FitRequest, observed: dict[str, float], effects: Mapping[str, float]
+) -> Callable[[worlds.DrawnWorld], SlideStatistics]:
     """Stand in for what a world shows: each statistic is the pilot's times one parameter's factor.
 
     Args:
         effects: numbers of the checks, of every world.
     """
 
-    def shown(world: worlds.World) -> Statistics:
+    def shown(world: worlds.DrawnWorld) -> SlideStatistics:
         factors = [
             value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it)
             for it in wanted.prior.parameters
@@ -84,7 +84,7 @@ def answering(
             name: value * factors[k % len(factors)]
             for k, (name, value) in enumerate(observed.items())
         }
-        return Statistics(found, dict(effects))
+        return SlideStatistics(found, dict(effects))
 
     return shown
 
@@ -140,7 +140,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     # what may be off either way is as in the pilot
     signed = {it.key: observed.effects[it.key] for it in CHECKS if it.signed}
     shown = answering(wanted, finite, EFFECTS | signed)
-    monkeypatch.setattr(worlds.World, "statistics", shown)
+    monkeypatch.setattr(worlds.DrawnWorld, "statistics", shown)
     fit = fitted(store, item, wanted)
     known = [it for it in fit.parameters if it.identified]
     assert len(known) == len(wanted.prior.parameters)
@@ -192,9 +192,9 @@ def test_no_interval_where_a_misfit_touches_its_parameter(
     signed = {it.key: observed.effects[it.key] for it in CHECKS if it.signed}
     # worlds in which noise hardly drifts, and the pilot's does
     shown = answering(wanted, finite, EFFECTS | signed | {NOISE_TREND: 0.1})
-    monkeypatch.setattr(worlds.World, "statistics", shown)
+    monkeypatch.setattr(worlds.DrawnWorld, "statistics", shown)
     drifting = replace(observed, effects=observed.effects | {NOISE_TREND: 30.0})
-    monkeypatch.setattr(Pilot, "statistics", lambda *_: drifting)
+    monkeypatch.setattr(PilotSlides, "statistics", lambda *_: drifting)
     fit = fitted(store, item, replace(wanted, needs=False))
     title = "noise of the event camera drifts during the pilot"
     assert [check.title for check in fit.checks if check.found] == [title]
@@ -225,9 +225,11 @@ def test_what_is_not_told_keeps_the_rigs_value(
     wanted = requested(tmp_path, seed=2)  # the store keeps the worlds of other tests' seed
     # one statistic, of the first parameter alone
     shown = answering(wanted, {"only": 2.0}, EFFECTS)
-    monkeypatch.setattr(worlds.World, "statistics", shown)
+    monkeypatch.setattr(worlds.DrawnWorld, "statistics", shown)
     monkeypatch.setattr(
-        Pilot, "statistics", lambda *_: Statistics({"only": 2.0}, dict.fromkeys(EFFECTS, 100.0))
+        PilotSlides,
+        "statistics",
+        lambda *_: SlideStatistics({"only": 2.0}, dict.fromkeys(EFFECTS, 100.0)),
     )
     fit = fitted(store, item, wanted)
     assert [it.key for it in fit.parameters if it.identified] == [PARAMETERS[0].key]

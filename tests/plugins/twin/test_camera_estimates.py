@@ -17,7 +17,7 @@ from sliplab.plugins.twin.event_times import (
     dead_time_us,
     find_scans,
 )
-from sliplab.plugins.twin.pilot import Camera, Forces, PilotTrial, Slide
+from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.plugins.twin.rims import CONTRAST, EDGE, HIDDEN, fit_rims
 from sliplab.protocols import load_plan
@@ -57,13 +57,13 @@ def trial(
     way = np.array([np.cos(angle), np.sin(angle)])
     return PilotTrial(
         "t",
-        Slide(depth, 1.0, way),
+        SlideMotion(depth, 1.0, way),
         HOLD_S,
         SLIDE_S,
         frame_s,
         np.broadcast_to(LAYOUT, (len(frame_s), *LAYOUT.shape)),
         np.outer(np.clip(frame_s, 0.0, None), way),
-        None if events is None else Camera(events, size),
+        None if events is None else SlideEvents(events, size),
     )
 
 
@@ -290,7 +290,7 @@ def only(made: PilotTrial, kept: np.ndarray) -> PilotTrial:
     assert made.camera is not None
     seen = made.camera.events
     events = EventChunk(seen.x[kept], seen.y[kept], seen.p[kept], seen.t_us[kept])
-    return replace(made, camera=Camera(events, made.camera.size_px))
+    return replace(made, camera=SlideEvents(events, made.camera.size_px))
 
 
 def test_positive_events_alone_give_noise_and_no_discs() -> None:

@@ -29,7 +29,7 @@ from sliplab.plugins.twin.contact_springs import (
     fit_springs,
     steady,
 )
-from sliplab.plugins.twin.pilot import Forces, PilotTrial, Slide
+from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
@@ -77,7 +77,7 @@ def slide(
     if forces is not None:
         force_s = np.arange(-2.0, 9.0 / speed, 0.001)
         load = Forces(force_s, forces(force_s) + rng.normal(0.0, 0.005, (len(force_s), 3)))
-    where = Slide(depth, speed, direction)
+    where = SlideMotion(depth, speed, direction)
     return PilotTrial("t", where, -2.0, 9.0 / speed, t, tips, base, None, load)
 
 

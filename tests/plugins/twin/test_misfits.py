@@ -35,7 +35,7 @@ from sliplab.plugins.twin.misfits import (
     ramp_mm,
     stream_of,
 )
-from sliplab.plugins.twin.pilot import Camera, PilotTrial, Slide
+from sliplab.plugins.twin.pilot import PilotTrial, SlideEvents, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.plugins.twin.trends import LAG, PULL
 from sliplab.protocols.plan import load_plan
@@ -125,7 +125,9 @@ def _slide(
         path[k] = now
     tips = rest + path[..., None] * way + rng.normal(0.0, 2e-4, (len(t), 19, 2))
     trial = f"{depth}-{speed}-{way}"
-    return PilotTrial(trial, Slide(depth, speed, way), -2.0, end_s, t, tips, base[:, None] * way)
+    return PilotTrial(
+        trial, SlideMotion(depth, speed, way), -2.0, end_s, t, tips, base[:, None] * way
+    )
 
 
 def numbers(trials: Sequence[PilotTrial]) -> dict[str, float]:
@@ -214,7 +216,7 @@ def lit(share: float, hz: float = 100.0, scans_hz: float = 0.0, seed: int = 0) -
             p[kept],
             np.round(t[kept] * 1e6).astype(np.int64),
         )
-        found.append(replace(trial, camera=Camera(events, (400, 400))))
+        found.append(replace(trial, camera=SlideEvents(events, (400, 400))))
     return found
 
 

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from sliplab.plugins.twin.posterior import (
     FEWEST,
     Bank,
-    Estimate,
+    ParameterPosterior,
     Posterior,
     fitted,
     posterior,
@@ -243,7 +243,7 @@ def test_an_unknown_gain_widens_what_goes_with_it_and_no_more() -> None:
     rng = np.random.default_rng(8)
     samples = rng.normal([1.0, -1.0, 0.0], [0.01, 0.01, 0.01], (400, 3))
     estimates = tuple(
-        Estimate(
+        ParameterPosterior(
             name,
             float(it.mean()),
             0.01,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.plugins.twin.pilot import Camera, Forces, PilotTrial, Slide
+from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents, SlideMotion
 from sliplab.plugins.twin.shown import (
     QUANTITIES,
     SameTrials,
-    Shown,
+    SlideCurves,
     compare,
     event_map,
     quantities,
@@ -30,10 +30,10 @@ def drawn(slip_s: float = 1.0, events: EventChunk | None = None) -> PilotTrial:
     path[:, 1] = np.maximum(t - slip_s, 0.0)
     tips = PLACES + path[..., None] * [1.0, 0.0]
     base = np.maximum(t, 0.0)[:, None] * [1.0, 0.0]
-    camera = None if events is None else Camera(events, (640, 480))
+    camera = None if events is None else SlideEvents(events, (640, 480))
     force_s = np.arange(-1.0, 4.0, 0.001)
     load = np.column_stack([0.0 * force_s, 3.0 * (force_s > 2.0), 0.0 * force_s + 2.5])
-    slide = Slide(2.8, 1.0, np.array([1.0, 0.0]))
+    slide = SlideMotion(2.8, 1.0, np.array([1.0, 0.0]))
     return PilotTrial("t", slide, -1.0, 4.0, t, tips, base, camera, Forces(force_s, load))
 
 
@@ -78,7 +78,7 @@ def test_rates_and_maps_count_positive_events_only() -> None:
 
 
 def test_worlds_are_compared_trial_by_trial() -> None:
-    def shown(*slips_s: float) -> list[Shown]:
+    def shown(*slips_s: float) -> list[SlideCurves]:
         return [show(drawn(slip_s)) for slip_s in slips_s]
 
     pilot = shown(1.0, 1.4)

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from sliplab.protocols.program import Position
-from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.guard import (
     MEASURED_MM,
@@ -31,7 +31,7 @@ PLATE = {"centre_mm": (450, 0, 300), "right_mm": (450, 20, 300), "above_mm": (45
 
 
 def guard(**more: Any) -> Guard:
-    return Guard(Limits(**{**BOX, **more}))
+    return Guard(ArmLimits(**{**BOX, **more}))
 
 
 def to(x: float, y: float, z: float, speed: float = 10.0, rotvec: Any = DOWN) -> Segment:
@@ -65,7 +65,7 @@ def test_errors_name_the_value_and_the_limit(
 
 def test_a_box_and_a_depth_may_follow_the_plate() -> None:
     held = Guard(
-        Limits(low_mm=(-8, -8, -30), high_mm=(8, 8, 4), frame="plate", plate=PLATE, depth_mm=2.5)  # type: ignore[arg-type]
+        ArmLimits(low_mm=(-8, -8, -30), high_mm=(8, 8, 4), frame="plate", plate=PLATE, depth_mm=2.5)  # type: ignore[arg-type]
     )
     held.check(BEGIN, [to(452.4, 0, 300), to(450, -7.9, 300)])
     with pytest.raises(WorkspaceError, match="x in the plate frame"):
@@ -113,7 +113,7 @@ def test_path_from_outside_may_end_no_farther_outside() -> None:
 
 
 def test_measured_poses_may_scatter_about_a_limit() -> None:
-    held = Guard(Limits(**BOX), PlateLimits(3.0, 10.0, 20.0))
+    held = Guard(ArmLimits(**BOX), PlateLimits(3.0, 10.0, 20.0))
     inside, outside = at(0, 0, 0), at(0, 0, 4)
     held.check_measured(at(0, 0, 3 + 0.9 * MEASURED_MM), inside, FRAME)
     held.check_measured(at(0, 0, 4 + 0.9 * MEASURED_MM), outside, FRAME)
@@ -131,6 +131,6 @@ def test_numbers_that_are_none_are_refused() -> None:
 
 def test_limits_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValidationError):
-        Limits(low_mm=(0, 0, 0), high_mm=(1, 0, 1))
+        ArmLimits(low_mm=(0, 0, 0), high_mm=(1, 0, 1))
     with pytest.raises(ValueError, match="need the taught plate"):
-        Guard(Limits(**BOX, depth_mm=2.0))
+        Guard(ArmLimits(**BOX, depth_mm=2.0))

@@ -14,7 +14,7 @@ import pytest
 
 from sliplab.protocols.program import Dwell, Move, Position, Program, Twist
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import ArmFault, GripperState, Mounting, Pose, RigError, Segment
 from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
@@ -539,7 +539,7 @@ def test_arm_that_leaves_the_limits_at_rest_is_stopped(way: Any) -> None:
 
 def test_tool_that_turns_on_its_way_beyond_the_limit_stops_the_arm() -> None:
     rig = plain_rig()
-    rig.guard = Guard(Limits(low_mm=(200, -99, 200), high_mm=(499, 99, 400), tilt_deg=10))
+    rig.guard = Guard(ArmLimits(low_mm=(200, -99, 200), high_mm=(499, 99, 400), tilt_deg=10))
     rig.move(Move("home", HOME, 10.0), rig.position())
     began = rig.clock.now_ns()
 
@@ -634,7 +634,7 @@ def test_touching_off_by_an_arm_that_never_arrives_ends() -> None:
 
 def test_limits_of_the_arm_are_held_for_a_driver_that_holds_none() -> None:
     rig = plain_rig()
-    box = Limits(low_mm=(300, -50, 200), high_mm=(399, 50, 400), tilt_deg=10)
+    box = ArmLimits(low_mm=(300, -50, 200), high_mm=(399, 50, 400), tilt_deg=10)
     rig.guard = Guard(box)
     arm = with_arm(rig)
     with pytest.raises(WorkspaceError, match="x in the base frame"):

@@ -18,7 +18,7 @@ from sliplab.rigs.devices.basler.fake import unplug
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, arrays
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.dvxplorer.source import EventSource
+from sliplab.rigs.devices.dvxplorer.source import DvxEventSource
 from sliplab.storage.streams import EventChunk
 
 pytestmark = pytest.mark.realtime
@@ -85,7 +85,7 @@ class Usb:
 
 def test_a_camera_on_usb_is_asked_by_names_that_the_library_has() -> None:
     usb = Usb()
-    source = EventSource(usb, usb, usb, (640, 480), "DVXplorer_DXA00001")
+    source = DvxEventSource(usb, usb, usb, (640, 480), "DVXplorer_DXA00001")
     health = source.health(DvxplorerSettings())
     assert (health.serial, health.firmware) == ("DXA00001", "7, logic 9")
     assert {"link super", "read-out constant 1000"} <= set(health.notes)

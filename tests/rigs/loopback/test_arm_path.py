@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.loopback.arm_path import FakeArmPath
-from sliplab.rigs.mock.path import TOOL, ContactPlane
+from sliplab.rigs.mock.path import TOOL, TrueSurface
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap
 
-PLANE = ContactPlane.from_settings(MockSettings().scene.contact)
+PLANE = TrueSurface.from_settings(MockSettings().scene.contact)
 HOME = PLANE.pose(0.0, 0.0, -5.0)
 AHEAD_NS = 7_000_000_000
 """Reading of the controller's clock at true time 0."""

@@ -10,7 +10,7 @@ import numpy as np
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
+from sliplab.rigs.mock.settings import MockFrameCameraSettings as FrameSettings
 from sliplab.rigs.mock.settings import MockSettings
 
 SMALL = MockSettings(frame_camera=FrameSettings(width=640, height=640, px_per_mm=4.0))

@@ -9,7 +9,12 @@ import numpy as np
 
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import Arm, Clocks, FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import (
+    ClockErrors,
+    MockArmSettings,
+    MockFrameCameraSettings,
+    MockSettings,
+)
 from sliplab.storage.streams import FrameChunk, PoseChunk
 
 CODE = 4321
@@ -25,9 +30,9 @@ def rig(
 ) -> MockDevices:
     """A rig that has no pictures, ready for a trial."""
     data = {
-        "frame_camera": FrameCamera(level="tracks", **(camera or {})).model_dump(),
-        "arm": Arm(**(arm or {})).model_dump(),
-        "clocks": Clocks(**(clocks or {})).model_dump(),
+        "frame_camera": MockFrameCameraSettings(level="tracks", **(camera or {})).model_dump(),
+        "arm": MockArmSettings(**(arm or {})).model_dump(),
+        "clocks": ClockErrors(**(clocks or {})).model_dump(),
         "faults": list(faults),
     }
     devices = build_mock(MockSettings.model_validate(data), Timing(**timing))

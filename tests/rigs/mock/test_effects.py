@@ -13,7 +13,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.path import TOOL, ContactPlane
+from sliplab.rigs.mock.path import TOOL, TrueSurface
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
@@ -153,8 +153,8 @@ def test_a_falling_plate_has_a_spot() -> None:
 def test_a_plate_tilted_against_what_was_taught_presses_one_side_deeper() -> None:
     """As docs/faults.md says how to make one: 1 degree more than `calibration.contact_plane`."""
     settings = MockSettings.model_validate({"scene": {"contact": {"tilt_deg": 1.4}}})
-    taught = ContactPlane.from_settings(MockSettings().scene.contact)
-    plane = ContactPlane.from_settings(settings.scene.contact)
+    taught = TrueSurface.from_settings(MockSettings().scene.contact)
+    plane = TrueSurface.from_settings(settings.scene.contact)
     sensor = plane.sensor(taught.pose(0.0, 0.0, 2.6))
     assert math.hypot(sensor[3], sensor[4]) == pytest.approx(math.sin(math.radians(1.0)), rel=1e-9)
     layout = skin_of(settings).layout_mm

@@ -8,7 +8,7 @@ import pytest
 from sliplab.analysis.labels.plate_tracking import track_video
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.storage.streams import FrameChunk
 
@@ -17,7 +17,7 @@ SIZE = 832
 
 def rig(**camera: Any) -> MockDevices:
     """A connected rig, its skin 2.6 mm deep in the plate."""
-    devices = build_mock(MockSettings(frame_camera=FrameCamera(**camera)))
+    devices = build_mock(MockSettings(frame_camera=MockFrameCameraSettings(**camera)))
     devices.arm.connect()
     devices.begin_trial(7)
     return devices
@@ -152,7 +152,7 @@ def test_a_fast_fall_is_smeared_in_the_video_and_its_mean_in_the_tracks() -> Non
 
 
 def test_the_noise_of_tracks_is_that_of_tracking_the_video() -> None:
-    settings = FrameCamera()
+    settings = MockFrameCameraSettings()
     devices = build_mock(MockSettings())
     layout = devices.world.skin.layout_mm
     frames = 160

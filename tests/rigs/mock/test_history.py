@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.history import GrowingTable
 
 
-def filled(times: list[int]) -> History:
-    history = History(2)
+def filled(times: list[int]) -> GrowingTable:
+    history = GrowingTable(2)
     history.grow(np.array(times, np.int64))[:] = np.array(times)[:, None] * [1.0, -2.0]
     return history
 
@@ -28,7 +28,7 @@ def test_rows_between_reach_over_both_ends() -> None:
     with pytest.raises(IndexError, match="before the kept history"):
         history.between(-1, 3)
     with pytest.raises(IndexError):
-        History(2).between(0, 1)
+        GrowingTable(2).between(0, 1)
 
 
 def test_between_rows_the_line_is_straight_and_after_the_end_it_stays() -> None:

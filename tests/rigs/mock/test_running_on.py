@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from tests.rigs.mock.driving import SMALL
 
 CLOCKS = ("arm", "event_camera", "frame_camera")
 
 
-def shown(world: World) -> list[int]:
+def shown(world: SimulatedWorld) -> list[int]:
     """Return the current readings of the devices' clocks, ns."""
     clocks = (getattr(world.clocks, name) for name in CLOCKS)
     return [int(clock.to_reference(world.now_ns)) for clock in clocks]
 
 
 def test_clocks_go_on_from_trial_to_trial() -> None:
-    world = World(SMALL, run_on=True)
+    world = SimulatedWorld(SMALL, run_on=True)
     world.pass_time(1_234_567_891)
     drifts = [getattr(world.clocks, name).drift for name in CLOCKS]
     for seed in (11, 12, 13):
@@ -33,7 +33,7 @@ def test_clocks_go_on_from_trial_to_trial() -> None:
 
 
 def test_the_rest_is_drawn_anew_by_the_trials_seed() -> None:
-    one, other = World(SMALL, run_on=True), World(SMALL, run_on=True)
+    one, other = SimulatedWorld(SMALL, run_on=True), SimulatedWorld(SMALL, run_on=True)
     other.pass_time(5_000_000_000)
     for world in (one, other):
         world.begin_trial(21)
@@ -44,7 +44,7 @@ def test_the_rest_is_drawn_anew_by_the_trials_seed() -> None:
 
 
 def test_else_every_trial_finds_them_at_a_time_of_its_own() -> None:
-    world = World(SMALL)
+    world = SimulatedWorld(SMALL)
     world.begin_trial(11)
     first = shown(world)
     world.pass_time(2_000_000_000)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.rigs.mock.devices import MockDevices
-from sliplab.rigs.mock.settings import Clocks, FrameCamera, MockSettings
+from sliplab.rigs.mock.settings import ClockErrors, MockFrameCameraSettings, MockSettings
 from sliplab.rigs.mock.sync import FreeRun
-from sliplab.rigs.mock.world import World
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.streams import ClockReads
 from tests.rigs.mock.standing import CODE, rig
 
@@ -30,10 +30,10 @@ CASES: tuple[list[dict[str, Any]], ...] = (
 
 def running(faults: list[dict[str, Any]], rate_hz: float = 100.0, after_s: float = 0.7) -> FreeRun:
     """A camera that was started some time into a trial."""
-    data: dict[str, Any] = {"clocks": Clocks(frame_camera_ppm=20_000).model_dump()}
-    data["frame_camera"] = FrameCamera(rate_hz=rate_hz).model_dump()
+    data: dict[str, Any] = {"clocks": ClockErrors(frame_camera_ppm=20_000).model_dump()}
+    data["frame_camera"] = MockFrameCameraSettings(rate_hz=rate_hz).model_dump()
     data["faults"] = [{**fault, "device": "frame_camera"} for fault in faults]
-    world = World(MockSettings.model_validate(data))
+    world = SimulatedWorld(MockSettings.model_validate(data))
     camera = FreeRun(world)
     world.begin_trial(5)
     world.pass_time(round(after_s * 1e9))

@@ -10,7 +10,7 @@ import pytest
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.mock.clocks import trial_clocks
-from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.mock.settings import ClockErrors
 from tests.rigs.mock.standing import CODE, on_box, record, rig, same
 
 EXPOSURE_NS = 2_000_000
@@ -55,7 +55,7 @@ def test_it_drifts_against_the_box_by_its_ppm() -> None:
     clocks = {"frame_camera_ppm": 15_000.0, "sync_box_ppm": 5_000.0}
     devices = rig({"frames": "exposure line"}, clocks=clocks)
     found = record(devices, 4.0)
-    true = trial_clocks(Clocks(**clocks), 1, 7)
+    true = trial_clocks(ClockErrors(**clocks), 1, 7)
     # a clock that gains has more cycles in a second
     rates = 1 + np.array([true.frame_camera.drift_ppm(), true.sync_box_ppb / 1000]) * 1e-6
     assert abs(rates[0] / rates[1] - 1) > 1e-4

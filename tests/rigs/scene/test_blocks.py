@@ -11,7 +11,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.scene.contact import BLOCK, LANES, Step, make_blocks, move_tips, store_state
+from sliplab.rigs.scene.contact import (
+    BLOCK,
+    LANES,
+    ContactStep,
+    make_blocks,
+    move_tips,
+    store_state,
+)
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
 from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import (
@@ -37,7 +44,9 @@ def states(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-unt
     decay, gain = relaxing(h, law.relaxation_s)
     found = np.empty((sensor.shape[0], *state.shape))
     for k in range(sensor.shape[0]):
-        move_tips(blocks, n, field, law, sensor[k], plate_y[k], k * h, Step(h, decay, gain, 0.0))
+        move_tips(
+            blocks, n, field, law, sensor[k], plate_y[k], k * h, ContactStep(h, decay, gain, 0.0)
+        )
         store_state(blocks, state)
         found[k] = state
     return found

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.mock.settings import EventCamera
+from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
-from sliplab.rigs.scene.readout import Scans, sort_packed
+from sliplab.rigs.scene.readout import ScanTimes, sort_packed
 
 ONE = np.zeros((1, 2))
 BUSY = {"width": 160, "height": 120, "noise_hz": 5.0, "hot_hz": 900.0, "refractory_us": 50.0}
@@ -31,14 +31,14 @@ def sensed(readout_hz: float, seed: int = 3, end_ms: int = 640, **changes: float
     return sensor.sense(loads, t_ns)
 
 
-def scans_of(readout_hz: float, **changes: float) -> Scans:
+def scans_of(readout_hz: float, **changes: float) -> ScanTimes:
     """When the camera of `sensed` scans."""
     sensor = MarkerSensor(EventOptics(**{**BUSY, "readout_hz": readout_hz, **changes}), ONE, 1)
     sensor.reset(np.zeros(3), 3)
     return sensor.scans
 
 
-def scanned(true: Events, scans: Scans, end_ns: int) -> Events:
+def scanned(true: Events, scans: ScanTimes, end_ns: int) -> Events:
     """The true events as scans would report them, one by one, in plain Python."""
     period_ns, phase_ns = scans.period_ns, scans.phase_ns
     first: dict[tuple[int, int, int], int] = {}
@@ -74,7 +74,7 @@ def test_columns_of_the_default_read_out_have_stamps_of_their_own(rate_hz: float
     A recording of a real DVXplorer has 243,501 distinct stamps of 255,283 events, 95.4 %: what a
     scan of 5000 Hz over 192 us gives at about 90,000 even events a second.
     """
-    settings = EventCamera().model_dump()
+    settings = MockEventCameraSettings().model_dump()
     optics = EventOptics(
         **{**settings, "noise_hz": rate_hz / (640 * 480), "hot_pixels": 0, "radius_mm": 1e-3}
     )

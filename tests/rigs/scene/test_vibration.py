@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.vibration import Vibration
+from sliplab.rigs.scene.vibration import ArmVibration
 
 T_NS = np.arange(20_000, dtype=np.int64) * 1_000_000
 
 
 def test_it_stays_within_its_peak_and_band() -> None:
-    trembling = Vibration(15.0, 5.0, rig_seed=1, trial_seed=2)
+    trembling = ArmVibration(15.0, 5.0, rig_seed=1, trial_seed=2)
     moved = trembling.at(T_NS)
     assert trembling
     assert moved.shape == (20_000, 3)
@@ -21,16 +21,16 @@ def test_it_stays_within_its_peak_and_band() -> None:
 
 
 def test_tones_are_the_rigs_and_phases_the_trials() -> None:
-    first, again = (Vibration(15.0, 5.0, 1, 2).at(T_NS) for _ in range(2))
+    first, again = (ArmVibration(15.0, 5.0, 1, 2).at(T_NS) for _ in range(2))
     assert np.array_equal(first, again)
-    other = Vibration(15.0, 5.0, 1, 3).at(T_NS)
+    other = ArmVibration(15.0, 5.0, 1, 3).at(T_NS)
     assert not np.allclose(first, other)
     spectra = [np.argmax(np.abs(np.fft.rfft(m[:, 0]))) for m in (first, other)]
     assert spectra[0] == pytest.approx(spectra[1], abs=40)
 
 
 def test_trials_tremble_from_not_at_all_to_the_peak() -> None:
-    peaks = [np.abs(Vibration(15.0, 5.0, 1, seed).at(T_NS)).max() for seed in range(60)]
+    peaks = [np.abs(ArmVibration(15.0, 5.0, 1, seed).at(T_NS)).max() for seed in range(60)]
     # largest values of two sines come within a per cent of their sum in 20 s
     assert max(peaks) > 0.013
     assert min(peaks) < 0.002
@@ -38,6 +38,6 @@ def test_trials_tremble_from_not_at_all_to_the_peak() -> None:
 
 
 def test_without_amplitude_there_is_none() -> None:
-    still = Vibration(0.0, 5.0, 1, 2)
+    still = ArmVibration(0.0, 5.0, 1, 2)
     assert not still
     assert np.all(still.at(T_NS) == 0.0)

@@ -12,7 +12,7 @@ import hdf5plugin
 import numpy as np
 
 from sliplab.plugins.formats.ros import messages as ros2
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers
 from sliplab.storage.streams import EventChunk
@@ -40,9 +40,9 @@ def part_of(chunk: EventChunk, low: int, high: int) -> EventChunk:
 def write_aedat4(path: Path) -> None:
     """Packets of 100 events, a trigger with each, a frame with every tenth."""
     streams = {
-        0: Stream("EVTS", "events", SIZE, "camera"),
-        1: Stream("FRME", "frames", (8, 6), "camera"),
-        2: Stream("TRIG", "triggers", None, "camera"),
+        0: Aedat4Stream("EVTS", "events", SIZE, "camera"),
+        1: Aedat4Stream("FRME", "frames", (8, 6), "camera"),
+        2: Aedat4Stream("TRIG", "triggers", None, "camera"),
     }
     whole = all_events()
     with Aedat4Writer(path, streams) as file:

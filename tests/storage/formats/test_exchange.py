@@ -21,7 +21,7 @@ import pytest
 from sliplab.plugins.formats.lab import events as lab
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.export_trials import export_trials, label_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST, FormatError, Triggers
@@ -97,9 +97,9 @@ def _aedat4(path: Path, t0: int = 1_663_249_605_718_334) -> tuple[EventChunk, Tr
     events = EventChunk(x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8), t_us)
     triggers = Triggers(t0 + np.arange(9, dtype=np.int64) * 1000, np.arange(9).astype(np.uint8))
     streams = {
-        0: Stream("EVTS", "events", (640, 480), "camera"),
-        1: Stream("FRME", "frames", (33, 21), "camera"),
-        2: Stream("TRIG", "triggers", None, "camera"),
+        0: Aedat4Stream("EVTS", "events", (640, 480), "camera"),
+        1: Aedat4Stream("FRME", "frames", (33, 21), "camera"),
+        2: Aedat4Stream("TRIG", "triggers", None, "camera"),
     }
     with Aedat4Writer(path, streams) as file:
         file.events(0, events)
@@ -204,7 +204,7 @@ def test_a_frame_is_at_the_middle_of_its_exposure(tmp_path: Path) -> None:
 
 def _frame(path: Path, *times: int) -> None:
     """A frame with its time stamp and the start and the end of its exposure."""
-    streams = {0: Stream("EVTS", "e", (8, 6), "x"), 1: Stream("FRME", "f", (1, 1), "x")}
+    streams = {0: Aedat4Stream("EVTS", "e", (8, 6), "x"), 1: Aedat4Stream("FRME", "f", (1, 1), "x")}
     with Aedat4Writer(path, streams) as file:
         made = frame_buffer(np.zeros((1, 1), np.uint8), 99)
         told = struct.pack("<5q", times[0], 0, 0, *times[1:])
@@ -228,7 +228,7 @@ def test_an_exposure_that_ends_before_it_starts_is_refused(tmp_path: Path) -> No
 
 def _packets(path: Path, whole: EventChunk, lengths: list[int]) -> None:
     """Events in packets of such lengths, as cameras write them."""
-    with Aedat4Writer(path, {0: Stream("EVTS", "events", (640, 480), "camera")}) as file:
+    with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (640, 480), "camera")}) as file:
         ends = np.cumsum(lengths).tolist()
         for low, high in zip([0, *ends[:-1]], ends, strict=True):
             columns = (whole.x, whole.y, whole.p, whole.t_us)
@@ -295,7 +295,9 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
     column = np.arange(300, dtype=np.uint16)
     times = np.concatenate([[0], later + np.arange(299)]).astype(np.int64)
     whole = EventChunk(column, column, (column % 2).astype(np.uint8), times)
-    with Aedat4Writer(tmp_path / "a.aedat4", {0: Stream("EVTS", "e", (346, 300), "x")}) as file:
+    with Aedat4Writer(
+        tmp_path / "a.aedat4", {0: Aedat4Stream("EVTS", "e", (346, 300), "x")}
+    ) as file:
         file.events(0, whole)
     made = Store.create(tmp_path / "store")
     path = tmp_path / "a.aedat4"
@@ -442,7 +444,7 @@ def _damaged_aedat4(change: Callable[[bytes], bytes]) -> Callable[[Path], Path]:
 
 
 def _late(folder: Path) -> Path:
-    streams = {0: Stream("EVTS", "e", (8, 6), "x"), 1: Stream("FRME", "f", (2, 2), "x")}
+    streams = {0: Aedat4Stream("EVTS", "e", (8, 6), "x"), 1: Aedat4Stream("FRME", "f", (2, 2), "x")}
     with Aedat4Writer(folder / "bad.aedat4", streams) as file:
         file.picture(1, np.zeros((2, 2), np.uint8), 1 << 55)  # its nanoseconds need 65 bits
     return folder / "bad.aedat4"

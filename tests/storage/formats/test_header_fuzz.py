@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
 from tests.command_line import here
 from tests.plugins.formats.test_prophesee import HEADS, cd, dat, evt2, evt3, evt21, high, write
@@ -51,7 +51,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(folder / form, form, data)
     (folder / "aedat4").mkdir()
     at = np.arange(100)
-    streams = {0: Stream("EVTS", "events", (64, 48), "camera")}
+    streams = {0: Aedat4Stream("EVTS", "events", (64, 48), "camera")}
     with Aedat4Writer(folder / "aedat4" / "a.aedat4", streams) as file:
         xy = (at % 48).astype(np.uint16)
         file.events(0, EventChunk(xy, xy, (at % 2).astype(np.uint8), 10**15 + at.astype(np.int64)))

@@ -22,7 +22,7 @@ import pytest
 from sliplab.analysis.campaigns import Collected
 from sliplab.storage.files import safe_name
 from sliplab.storage.formats import import_trials as import_module
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers
 from sliplab.storage.formats.import_trials import import_trials
@@ -78,7 +78,7 @@ def _events(times: Any) -> EventChunk:
 
 
 def _aedat4(path: Path, *packets: Any) -> None:
-    with Aedat4Writer(path, {0: Stream("EVTS", "events", (40, 40), "camera")}) as file:
+    with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (40, 40), "camera")}) as file:
         for times in packets:
             file._write(0, events_buffer(_events(times)))
 
@@ -358,9 +358,9 @@ def test_one_bad_episode_leaves_the_others(tmp_path: Path, number: int) -> None:
 
 def _frames(path: Path, times: list[int], images: Any) -> None:
     streams = {
-        0: Stream("EVTS", "events", (40, 40), "camera"),
-        1: Stream("FRME", "frames", (8, 6), "camera"),
-        2: Stream("TRIG", "triggers", None, "camera"),
+        0: Aedat4Stream("EVTS", "events", (40, 40), "camera"),
+        1: Aedat4Stream("FRME", "frames", (8, 6), "camera"),
+        2: Aedat4Stream("TRIG", "triggers", None, "camera"),
     }
     with Aedat4Writer(path, streams) as file:
         file.events(0, _events(np.arange(COUNT)))

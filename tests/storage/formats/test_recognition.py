@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
@@ -111,7 +111,7 @@ def test_two_files_of_one_polarity_cost_their_recording_alone(tmp_path: Path) ->
 
 
 def _aedat4(path: Path, chunk: EventChunk) -> None:
-    with Aedat4Writer(path, {0: Stream("EVTS", "e", (64, 48), "x")}) as file:
+    with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "e", (64, 48), "x")}) as file:
         file.events(0, chunk)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.schema.trial import Lost
@@ -229,7 +229,7 @@ def test_an_event_outside_of_the_camera_is_no_damage(tmp_path: Path) -> None:
     path, whole = tmp_path / "a.aedat4", all_events()
     wrong = 17 * PACKET + 5
     whole.x[wrong] = 640
-    with Aedat4Writer(path, {0: Stream("EVTS", "events", (640, 480), "camera")}) as file:
+    with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (640, 480), "camera")}) as file:
         for low in range(0, COUNT, PACKET):
             file.events(0, part_of(whole, low, low + PACKET))
     for outcome in _try(tmp_path, "aedat4", path.read_bytes()):

@@ -13,7 +13,7 @@ import pytest
 from scipy.io import savemat
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.known import known_formats
 from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from tests.storage.formats.recordings import all_events
@@ -90,7 +90,9 @@ def test_a_stated_kind_does_not_mistake_it_for_another(tmp_path: Path, kind: str
 def test_among_other_files_it_is_skipped_with_the_reason(tmp_path: Path) -> None:
     for name, (file, write, _) in FILES.items():
         write(tmp_path / f"{name} {file}")
-    with Aedat4Writer(tmp_path / "b.aedat4", {0: Stream("EVTS", "e", (640, 480), "x")}) as writer:
+    with Aedat4Writer(
+        tmp_path / "b.aedat4", {0: Aedat4Stream("EVTS", "e", (640, 480), "x")}
+    ) as writer:
         writer.events(0, all_events(100))
     assert kind_of(tmp_path) == "aedat4"
     skipped = {item.file: item.reason for item in skipped_in(tmp_path, "aedat4")}

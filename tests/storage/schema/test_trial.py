@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.storage.files import json_text
 from sliplab.storage.schema.document import DocumentError, NewerFormat
-from sliplab.storage.schema.trial import Clocks, TrialRecord
+from sliplab.storage.schema.trial import TrialClockMaps, TrialRecord
 from tests.protocols.planning import put_all, rows
 from tests.storage.trial_files import record
 
@@ -67,8 +67,8 @@ def test_a_rejected_attempt_may_lack_the_clock_of_its_events() -> None:
 
 
 def test_uncertainty_against_events_counts_both_maps() -> None:
-    clocks: Clocks = record("t").clocks
+    clocks: TrialClockMaps = record("t").clocks
     assert clocks.against_events_ns("events") == 1000.0
     assert clocks.against_events_ns("arm") == 2000.0
     unknown = {**clocks.to_json(), "arm": {**clocks.to_json()["arm"], "uncertainty_ns": None}}
-    assert Clocks.model_validate(unknown).against_events_ns("arm") is None
+    assert TrialClockMaps.model_validate(unknown).against_events_ns("arm") is None

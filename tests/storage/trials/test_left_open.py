@@ -16,7 +16,7 @@ import h5py
 import pytest
 
 from sliplab.plugins.publish.forms import publish
-from sliplab.plugins.publish.publication import About, Publication
+from sliplab.plugins.publish.publication import Publication, PublicationInfo
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import push
@@ -133,7 +133,7 @@ def test_trial_is_read_while_this_program_has_it_open(mode: str, how: str, where
 
 def test_copies_of_what_was_left_open_are_as_committed(where: Campaign, tmp_path: Path) -> None:
     before = leave_open(data_of(where))
-    about = About("Trials", ("somebody",), None, "2026-01-01")
+    about = PublicationInfo("Trials", ("somebody",), None, "2026-01-01")
     store = store_of(where)
     publish(Publication(store, (where,), about), tmp_path / "published", "croissant")
     assert (tmp_path / "published/campaigns/c/trials/t/data.h5").read_bytes() == before

@@ -11,10 +11,10 @@ import pytest
 
 from sliplab.storage.process import user_name
 from sliplab.storage.trials import review
-from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.review import ReviewedOnsets
 from sliplab.storage.trials.store import Store, StoreError
 
-OLD, NEW = Onsets(100, 200), Onsets(110, 250)
+OLD, NEW = ReviewedOnsets(100, 200), ReviewedOnsets(110, 250)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_the_history_is_kept_whole(store: Store) -> None:
     assert review.last(store, "c", "t") is None
     made = [
         decide(store, 0, who="anna"),
-        decide(store, 1, "reject", new=Onsets(), label="k2"),
+        decide(store, 1, "reject", new=ReviewedOnsets(), label="k2"),
         decide(store, 2, "reopen"),
     ]
     assert review.history(store, "c", "t") == made
@@ -79,8 +79,8 @@ def test_of_many_who_decide_at_once_each_is_kept_or_told(store: Store) -> None:
     ("verdict", "more", "problem"),
     [
         ("reject", {"why": "  "}, "needs a reason"),
-        ("adjust", {"new": Onsets(None, 5)}, "needs an incipient one"),
-        ("adjust", {"new": Onsets(6, 5)}, "must not come before"),
+        ("adjust", {"new": ReviewedOnsets(None, 5)}, "needs an incipient one"),
+        ("adjust", {"new": ReviewedOnsets(6, 5)}, "must not come before"),
         ("maybe", {}, "must be one of accept, adjust, reject, reopen"),
     ],
 )

@@ -11,14 +11,14 @@ import pytest
 import yaml
 
 from sliplab.analysis.campaigns import collected, training_campaigns
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import wanted_models
 from sliplab.analysis.study import Finding
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest, make_request
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.bench.stress.document import StressRecord
 from sliplab.plugins.bench.stress.flow import measure_stress, request
 from sliplab.plugins.bench.stress.study import STUDY
@@ -48,7 +48,7 @@ def disturbed(folder: Path, split: str = "test", **levels: list[Any]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome]) -> Store:
+def store(ran: tuple[list[RunRequest], StudyOutcome]) -> Store:
     """The small study."""
     return Store.open(ran[0][0].store)
 
@@ -144,7 +144,7 @@ def test_a_campaign_with_nuisances_trains_only_if_it_is_asked_for(
         assert [item.name for item in campaigns] == ["slides", *["disturbed"] * trains]
         assert [item.name for item in collected(store, ["disturbed"])] == ["disturbed"]
         label(store, campaigns)
-        samples = load_samples(Labels(store), campaigns, "train")
+        samples = load_samples(StoreLabels(store), campaigns, "train")
         assert ("disturbed" in {name for name, _ in samples.trials}) is trains
         assert training_campaigns(campaigns)[0].name == "slides"
         assert wanted_models(store, campaigns)

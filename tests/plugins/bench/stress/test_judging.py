@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sliplab.analysis.detectors.detectors import Evidence, Predictions, Smoothing
+from sliplab.analysis.detectors.detectors import Predictions, Smoothing, WindowEvidence
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.plugins.bench.stress.judging import (
     ALL,
-    Outcome,
     StressTrial,
+    TrialDetection,
     alarms,
     figures,
     groups,
@@ -55,9 +55,9 @@ def test_what_lies_before_an_alarm_is_forgotten() -> None:
 
     @dataclass(frozen=True)
     class Summing:
-        def evidence(self, predictions: Predictions) -> Evidence:
+        def evidence(self, predictions: Predictions) -> WindowEvidence:
             total = predictions.counts[:, 1].cumsum().astype(np.float64)
-            return Evidence(predictions.end_ns, total, lambda first: total)
+            return WindowEvidence(predictions.end_ns, total, lambda first: total)
 
     found = alarms(Summing(), 49.5, predictions(np.ones(400, np.int64)))
     assert found[0] == 50 * STRIDE
@@ -67,15 +67,17 @@ def test_what_lies_before_an_alarm_is_forgotten() -> None:
 @pytest.mark.parametrize(
     ("at_ns", "expected"),
     [
-        ([], Outcome(0, None)),
-        ([SLIP.incipient_ns - TOLERANCE], Outcome(0, SLIP.incipient_ns - TOLERANCE)),
-        ([SLIP.incipient_ns - TOLERANCE - 1], Outcome(1, None)),
-        ([1 * S, 5 * S, 11 * S, 13 * S], Outcome(2, 11 * S)),
-        ([SLIP.gross_ns - 1], Outcome(0, SLIP.gross_ns - 1)),
-        ([SLIP.gross_ns], Outcome(0, None)),
+        ([], TrialDetection(0, None)),
+        ([SLIP.incipient_ns - TOLERANCE], TrialDetection(0, SLIP.incipient_ns - TOLERANCE)),
+        ([SLIP.incipient_ns - TOLERANCE - 1], TrialDetection(1, None)),
+        ([1 * S, 5 * S, 11 * S, 13 * S], TrialDetection(2, 11 * S)),
+        ([SLIP.gross_ns - 1], TrialDetection(0, SLIP.gross_ns - 1)),
+        ([SLIP.gross_ns], TrialDetection(0, None)),
     ],
 )
-def test_an_alarm_is_false_a_detection_or_too_late(at_ns: list[int], expected: Outcome) -> None:
+def test_an_alarm_is_false_a_detection_or_too_late(
+    at_ns: list[int], expected: TrialDetection
+) -> None:
     assert outcome(np.array(at_ns, np.int64), SLIP, TOLERANCE) == expected
 
 
@@ -86,7 +88,11 @@ def trial(nuisance: str = "none", strength: float = 100.0, hold_s: int = 10) -> 
 
 def test_figures_count_what_happened() -> None:
     at = 10 * S + 40 * MS
-    rows = [(trial(), Outcome(0, at)), (trial(), Outcome(2, at)), (trial(), Outcome(0, None))]
+    rows = [
+        (trial(), TrialDetection(0, at)),
+        (trial(), TrialDetection(2, at)),
+        (trial(), TrialDetection(0, None)),
+    ]
     found = figures("none", 100.0, rows)
     assert (found.trials, found.false_alarms, found.missed) == (3, 2, 1)
     assert found.clean.value == pytest.approx(1 / 3)
@@ -96,9 +102,9 @@ def test_figures_count_what_happened() -> None:
 
 def test_rate_of_alarms_is_wider_where_trials_of_a_condition_differ() -> None:
     """The same 72 alarms: six in each trial under brushing, or all in three of them."""
-    quiet = [(trial("none"), Outcome(0, None))] * 12
-    alike = [(trial("brush"), Outcome(6, None))] * 12
-    apart = [(trial("brush"), Outcome(24 if k < 3 else 0, None)) for k in range(12)]
+    quiet = [(trial("none"), TrialDetection(0, None))] * 12
+    alike = [(trial("brush"), TrialDetection(6, None))] * 12
+    apart = [(trial("brush"), TrialDetection(24 if k < 3 else 0, None)) for k in range(12)]
     poisson = [chi2.ppf(share, 144 + odd) / 2 for share, odd in ((0.025, 0), (0.975, 2))]
     found = figures(ALL, None, quiet + alike).per_hour
     # conditions differ in every repetition alike, so that is no chance
@@ -111,15 +117,15 @@ def test_rate_of_alarms_is_wider_where_trials_of_a_condition_differ() -> None:
 
 
 def test_one_trial_has_a_rate_without_interval() -> None:
-    found = figures("none", 100.0, [(trial(), Outcome(3, None))]).per_hour
+    found = figures("none", 100.0, [(trial(), TrialDetection(3, None))]).per_hour
     assert (found.low, found.high) == (None, None)
 
 
 def test_missed_slips_are_infinitely_late_in_the_median() -> None:
     at = [10 * S + ms * MS for ms in (40, 60, 80)]
-    rows = [(trial(), Outcome(0, ns)) for ns in at]
+    rows = [(trial(), TrialDetection(0, ns)) for ns in at]
     assert figures("none", None, rows).latency_ms == 60.0
-    missed = [(trial(), Outcome(0, None))] * 2
+    missed = [(trial(), TrialDetection(0, None))] * 2
     assert figures("none", None, rows + missed).latency_ms == 80.0
     assert figures("none", None, rows + missed).latency_true_ms == 180.0
     assert figures("none", None, rows + missed * 2).latency_ms is None
@@ -146,7 +152,7 @@ class Says:
     kind: str
     seed: int = 0
 
-    def evidence(self, predictions: Predictions) -> Evidence:
+    def evidence(self, predictions: Predictions) -> WindowEvidence:
         n, end_ns = len(predictions), predictions.end_ns
         said = {
             "always": lambda: np.ones(n),
@@ -157,7 +163,7 @@ class Says:
             ).astype(float),
             "clock": lambda: (np.abs(end_ns - 44.9 * S) < STRIDE).astype(float),
         }[self.kind]()
-        return Evidence(end_ns, said, lambda first: said)
+        return WindowEvidence(end_ns, said, lambda first: said)
 
 
 def test_who_does_not_look_is_at_the_bottom() -> None:

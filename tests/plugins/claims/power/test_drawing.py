@@ -12,14 +12,20 @@ import pytest
 
 from sliplab.plugins.claims.blocks import F64
 from sliplab.plugins.claims.document import ClaimState
-from sliplab.plugins.claims.evidence import Grid
+from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.power.document import ClaimPower
-from sliplab.plugins.claims.power.drawing import Drawing, Drawn, claim_powers, more_trials, spread
+from sliplab.plugins.claims.power.drawing import (
+    CampaignDraw,
+    Drawing,
+    claim_powers,
+    more_trials,
+    spread,
+)
 from sliplab.plugins.claims.power.resampling import (
     ASSUMED,
-    Axis,
-    Pilot,
+    PilotFigures,
     Sessions,
+    SharedFactor,
     sessions_text,
     shared_axes,
 )
@@ -47,20 +53,20 @@ def plan_of(claims: list[dict[str, Any]], repetitions: int = 60, **collection: A
     return make_plan(validate(Protocol, data, "p.yaml"), "p.yaml")
 
 
-def pilot_of(plan: Plan, depths: list[Decimal], values: dict[str, F64]) -> Pilot:
+def pilot_of(plan: Plan, depths: list[Decimal], values: dict[str, F64]) -> PilotFigures:
     """Trials at these depths, all in one block."""
     conditions = [{"depth": depth} for depth in depths]
     axes, _ = shared_axes(plan, conditions)
-    return Pilot(axes, tuple(conditions), np.zeros(len(depths), np.int64), values)
+    return PilotFigures(axes, tuple(conditions), np.zeros(len(depths), np.int64), values)
 
 
-def normal_pilot(plan: Plan, count: int, seed: int, deviation: float = 200.0) -> Pilot:
+def normal_pilot(plan: Plan, count: int, seed: int, deviation: float = 200.0) -> PilotFigures:
     """First slips of normal distribution around 1 s, the same at all depths."""
     values = np.random.default_rng(seed).normal(1000.0, deviation, count)
     return pilot_of(plan, [DEPTHS[k % 3] for k in range(count)], {"first_slip": values})
 
 
-def power_of(plan: Plan, pilot: Pilot, campaigns: int = 20) -> tuple[ClaimPower, ...]:
+def power_of(plan: Plan, pilot: PilotFigures, campaigns: int = 20) -> tuple[ClaimPower, ...]:
     """Draw campaigns."""
     drawing = Drawing(plan, pilot, 1)
     return claim_powers(drawing, [drawing.campaign(k) for k in range(campaigns)])
@@ -73,7 +79,7 @@ def test_normal_figures_take_as_many_trials_as_foretold() -> None:
     Campaigns of one and the same world differ by a factor of 1.3 in their trials themselves.
     """
     plan = plan_of([{"figure": "first_slip", "within": "80 ms"}], repetitions=120)
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     ratios, inside = [], 0
     for world in range(20):
         deviation = 150.0 + 5.0 * world
@@ -146,7 +152,7 @@ def test_undetected_trials_come_as_often_as_in_the_pilot() -> None:
     values[2::6] = np.inf
     values[0] = np.nan
     pilot = pilot_of(plan, depths, {"latency_gross": values})
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     drawn = [pilot.campaign(grid, np.random.default_rng(k))["latency_gross"] for k in range(20)]
     deepest = np.array([dict(trial.condition)["depth"] == DEPTHS[2] for trial in grid.trials])
     share = np.mean([np.isinf(each[deepest]).mean() for each in drawn])
@@ -169,13 +175,13 @@ def test_effects_of_factors_and_of_blocks_are_kept() -> None:
     blocks = np.arange(120) // 6
     of_block = rng.normal(0.0, 100.0, 20)[blocks]
     values = 300.0 * (np.arange(120) % 3) + of_block + rng.normal(0.0, 30.0, 120)
-    pilot = Pilot(
+    pilot = PilotFigures(
         pilot_of(plan, depths, {}).axes,
         tuple({"depth": depth} for depth in depths),
         blocks,
         {"first_slip": values},
     )
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     drawn = np.array(
         [pilot.campaign(grid, np.random.default_rng(k))["first_slip"] for k in range(30)]
     )
@@ -204,16 +210,16 @@ def test_levels_between_are_said_and_those_outside_are_refused() -> None:
 
 
 def test_directions_go_round() -> None:
-    axis = Axis("direction", tuple(map(Decimal, (0, 90, 180, 270))), turns=True)
+    axis = SharedFactor("direction", tuple(map(Decimal, (0, 90, 180, 270))), turns=True)
     rng = np.random.default_rng(0)
     assert axis.knows(Decimal(315))
     assert axis.weights(Decimal(315), rng) == pytest.approx([0.5, 0, 0, 0.5])
     assert axis.weights(Decimal(-30), rng) == pytest.approx([2 / 3, 0, 0, 1 / 3])
-    assert not Axis("twist", axis.levels).knows(Decimal(315))
+    assert not SharedFactor("twist", axis.levels).knows(Decimal(315))
 
 
 def test_words_that_the_pilot_lacks_are_taken_for_one_of_its_own() -> None:
-    axis = Axis("skin", ("a", "b"))
+    axis = SharedFactor("skin", ("a", "b"))
     rng = np.random.default_rng(0)
     drawn = np.array([axis.weights("c", rng) for _ in range(200)])
     assert set(map(tuple, drawn)) == {(1.0, 0.0), (0.0, 1.0)}
@@ -227,7 +233,7 @@ def test_a_number_of_trials_that_few_campaigns_reach() -> None:
 
 def test_an_adaptive_campaign_takes_one_more_round_than_it_needs() -> None:
     plan = plan_of([MEDIAN], order="adaptive", choice={"batch": 15, "start": 30})
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     values = {"first_slip": np.random.default_rng(1).normal(1000.0, 120.0, len(grid.trials))}
     found = course(plan, grid, values)
     (claim,) = found.claims
@@ -237,7 +243,7 @@ def test_an_adaptive_campaign_takes_one_more_round_than_it_needs() -> None:
 
 def test_least_and_most_bound_a_campaign() -> None:
     certain = {"figure": "first_slip", "at_most": "9 s"}
-    grid = Grid.of(plan := plan_of([certain], stopping={"least": 100}))
+    grid = TrialGrid.of(plan := plan_of([certain], stopping={"least": 100}))
     values = {"first_slip": np.random.default_rng(1).normal(1000.0, 120.0, len(grid.trials))}
     assert course(plan, grid, values).ended == 102
     short = plan_of([MEDIAN], stopping={"most": 20})
@@ -245,7 +251,7 @@ def test_least_and_most_bound_a_campaign() -> None:
     assert (found.ended, len(found.evidence.taken)) == (None, 18)
 
 
-def pilot_of_sessions(plan: Plan, away: float) -> Pilot:
+def pilot_of_sessions(plan: Plan, away: float) -> PilotFigures:
     """Six sessions of four blocks of six trials, by turns above and below 1 s; scatter 100 ms."""
     sessions = np.arange(144) // 24
     values = 1000.0 + np.random.default_rng(4).normal(0.0, 100.0, 144)
@@ -254,13 +260,13 @@ def pilot_of_sessions(plan: Plan, away: float) -> Pilot:
     return replace(found, blocks=np.arange(144) // 6, sessions=sessions)
 
 
-def drawn(plan: Plan, pilot: Pilot, sessions: Sessions) -> list[Drawn]:
+def drawn(plan: Plan, pilot: PilotFigures, sessions: Sessions) -> list[CampaignDraw]:
     """Draw campaigns."""
     drawing = Drawing(plan, pilot, 1, sessions)
     return [drawing.campaign(k) for k in range(10)]
 
 
-def median_trials(campaigns: list[Drawn]) -> float:
+def median_trials(campaigns: list[CampaignDraw]) -> float:
     """Median of the trials after which the first claim is called; infinite for never."""
     return float(np.median([it.called[0] or np.inf for it in campaigns]))
 
@@ -282,8 +288,8 @@ def test_sessions_without_differences_and_drift_change_nothing(collection: dict[
         assert drawn(plan, pilot, Sessions(1, 0.0, 0.0)) == alike
         if not collection:
             rng = np.random.default_rng([1, 0])
-            values = pilot.campaign(Grid.of(plan), rng)
-            none = course(plan, Grid.of(plan), values)
+            values = pilot.campaign(TrialGrid.of(plan), rng)
+            none = course(plan, TrialGrid.of(plan), values)
             assert alike[0].states == tuple(it.state for it in none.claims)
             assert drawn(plan, pilot, Sessions(4, 0.0)) == alike
 
@@ -301,7 +307,7 @@ def test_a_pilot_of_sessions_shows_how_they_differ() -> None:
 
 def test_sessions_and_a_drift_are_drawn_in_the_order_of_trials() -> None:
     plan = plan_of([MEDIAN], stopping={"most": 90})
-    grid, pilot = Grid.of(plan), pilot_of_sessions(plan, 150.0)
+    grid, pilot = TrialGrid.of(plan), pilot_of_sessions(plan, 150.0)
     found = np.array(
         [
             pilot.over_time(plan, grid, Sessions(3), np.random.default_rng(k))["first_slip"][:90]
@@ -333,7 +339,7 @@ def test_batches_are_the_blocks_of_an_adaptive_campaign() -> None:
     values = rng.normal(0.0, 100.0, 20)[blocks] + rng.normal(0.0, 30.0, 120)
     depths = [DEPTHS[k % 3] for k in range(120)]
     pilot = replace(pilot_of(plan, depths, {"first_slip": values}), blocks=blocks)
-    grid = Grid.of(plan)
+    grid = TrialGrid.of(plan)
     added = pilot.over_time(plan, grid, Sessions(), np.random.default_rng(1))["first_slip"]
     assert np.flatnonzero(np.diff(added)).tolist() == [29 + 15 * k for k in range(10)]
     many = [pilot.over_time(plan, grid, Sessions(), np.random.default_rng(k)) for k in range(50)]

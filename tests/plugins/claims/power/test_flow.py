@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.claims import trial_figures
 from sliplab.plugins.claims.power import flow as power
 from sliplab.plugins.claims.power import learning
@@ -23,7 +23,7 @@ from tests.flows.conftest import tiny, write
 
 DURATION = "{figure: slip_duration, within: 400 ms}"
 ACCURACY = "{figure: accuracy, at_least: 1 %}"
-Ran = tuple[list[RunRequest], Outcome]
+Ran = tuple[list[RunRequest], StudyOutcome]
 
 
 @pytest.fixture

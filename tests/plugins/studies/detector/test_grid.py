@@ -7,24 +7,24 @@ import pytest
 from sliplab.plugins.studies.detector.grid import (
     PAPER,
     Axes,
-    Setting,
+    NetworkSetting,
     counted_stride,
     make_grid,
     strides,
 )
-from sliplab.plugins.studies.detector.rows import Row, short_list
+from sliplab.plugins.studies.detector.rows import DetectorRow, short_list
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.settings import NetworkSettings, Windows
 
 
 def test_lines_and_the_small_cross_are_tried_once_each() -> None:
-    grid = make_grid(Axes(), Windows(), Network())
+    grid = make_grid(Axes(), Windows(), NetworkSettings())
     assert grid.settings[0] == PAPER
     assert len(grid.settings) == len(set(grid.settings)) == 16
-    assert Setting(length_ms=5, pool_px=10) in grid.settings
-    assert Setting(length_ms=10, pool_px=10) not in grid.settings
+    assert NetworkSetting(length_ms=5, pool_px=10) in grid.settings
+    assert NetworkSetting(length_ms=10, pool_px=10) not in grid.settings
     assert grid.left_out == {}
-    whole = make_grid(Axes(), Windows(), Network(), full=True)
+    whole = make_grid(Axes(), Windows(), NetworkSettings(), full=True)
     # 6 x 3 x 3 x 3, without steps of 2 ms in windows of 5 ms
     assert len(whole.settings) == 162 - 9
     assert len(whole.left_out) == 9
@@ -40,14 +40,14 @@ def test_what_no_network_can_have_is_refused_by_name() -> None:
         (Axes(length_ms=(0,)), "--length = 0: must lie between 1 and 1000"),
     ):
         with pytest.raises(InputError, match=words):
-            make_grid(axes, Windows(), Network())
+            make_grid(axes, Windows(), NetworkSettings())
 
 
 def test_widths_and_windows_are_those_asked_for() -> None:
-    setting = Setting(length_ms=10, step_ms=5, pool_px=40, width=0.5)
+    setting = NetworkSetting(length_ms=10, step_ms=5, pool_px=40, width=0.5)
     assert setting.windows(Windows()).steps == 2
     assert setting.windows(Windows()).cells == 10
-    network = setting.network(Network())
+    network = setting.network(NetworkSettings())
     assert (network.conv1_channels, network.conv2_channels, network.hidden) == (4, 8, 16)
 
 
@@ -59,10 +59,10 @@ def test_strides_are_multiples_of_the_finest_and_the_length() -> None:
 
 
 def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
-    def row(late: float, early: float, missed: float, work: float, test: float) -> Row:
+    def row(late: float, early: float, missed: float, work: float, test: float) -> DetectorRow:
         figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
         operations = {"synaptic_operations_per_s": [work]}
-        return Row(
+        return DetectorRow(
             PAPER,
             "trained",
             30,

@@ -21,10 +21,10 @@ from sliplab.flows.running import console, stopping
 from sliplab.plugins.studies.detector.grid import (
     PAPER,
     Axes,
-    Setting,
+    NetworkSetting,
     strides,
 )
-from sliplab.plugins.studies.detector.rows import OBJECTIVES, RULES, Row, mean
+from sliplab.plugins.studies.detector.rows import OBJECTIVES, RULES, DetectorRow, mean
 from sliplab.plugins.studies.detector.run import (
     NUMBERS,
     PAGE,
@@ -125,10 +125,10 @@ def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, res
 
 
 def test_the_front_is_the_definitions(result: Any) -> None:
-    rows = [Row.of_json(row) for row in result[0]["rows"]]
+    rows = [DetectorRow.of_json(row) for row in result[0]["rows"]]
     assert [row.as_json() for row in rows] == result[0]["rows"]
 
-    def costs(row: Row) -> list[float]:
+    def costs(row: DetectorRow) -> list[float]:
         values = [(row.objective(name), sign) for name, sign in OBJECTIVES.items()]
         return [float("inf") if value is None else sign * value for value, sign in values]
 
@@ -223,7 +223,7 @@ def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
 
 def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
     trials = detector_search(store, collected(store), SIZE, AXES).trials
-    for setting in (PAPER, Setting(length_ms=15)):
+    for setting in (PAPER, NetworkSetting(length_ms=15)):
         found = trials.samples(setting, trials.train, 10_000)
         whole = trials.samples(setting, trials.train, 25)
         assert len(whole) == 25

@@ -11,10 +11,10 @@ import pytest
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.networks.models import choose_model, wanted_models
-from sliplab.analysis.sweeps.runner import Task, task_sweep
+from sliplab.analysis.sweeps.runner import SweepTask, task_sweep
 from sliplab.flows import other_rig
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.studies.document import GeneralisationResults, NotTrained, UnseenScores
 from sliplab.plugins.studies.generalise import results as generalisation
 from sliplab.plugins.studies.generalise.results import Generalisation, markdown
@@ -30,7 +30,9 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(
+    ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
+) -> Store:
     """A copy of the small study, tried without one direction and on one other skin."""
     folder = tmp_path_factory.mktemp("generalisation") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -94,7 +96,7 @@ def test_what_is_kept_is_not_measured_again(store: Store) -> None:
     text = before.read_text()
     name = next(iter(other.results.load().results))
     for _ in range(2):
-        task_sweep([Task(name, "another key", work)], other.results).run()
+        task_sweep([SweepTask(name, "another key", work)], other.results).run()
     assert len(made) == 1
     before.write_text(text)
 
@@ -151,8 +153,8 @@ def test_the_file_is_the_same_to_the_byte(tmp_path: Path) -> None:
     counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
     y, trial = np.array([0, 1, 1, 2]), np.zeros(4, np.int64)
     tasks = [
-        Task("skin 101", "k1", lambda: generalisation.score_windows(counts, y, trial)),
-        Task("speed 1 mm/s", "k2", lambda: NotTrained(why="no train trials")),
+        SweepTask("skin 101", "k1", lambda: generalisation.score_windows(counts, y, trial)),
+        SweepTask("speed 1 mm/s", "k2", lambda: NotTrained(why="no train trials")),
     ]
     assert task_sweep(tasks, results).run() == 2
     assert results.path.read_text() == EXAMPLE == json_text(results.load().to_json())

@@ -26,7 +26,7 @@ from sliplab.plugins.twin.drift import flow as drift
 from sliplab.plugins.twin.drift.document import FRICTION, DriftFit
 from sliplab.plugins.twin.parameters import value_of
 from sliplab.plugins.twin.pilot import PilotTrial
-from sliplab.plugins.twin.statistics import Statistics
+from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
@@ -77,15 +77,17 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     rig, _ = load_rig_file(Path("rehearsal"))
     prior = drift.OneSpecimen(rig, 0.5, 1, False)
 
-    def of(values: dict[str, float], rng: np.random.Generator) -> Statistics:
+    def of(values: dict[str, float], rng: np.random.Generator) -> SlideStatistics:
         noise = np.exp(1e-3 * rng.normal(size=len(values)))
-        return Statistics(dict(zip(values, np.array([*values.values()]) * noise, strict=True)), {})
+        return SlideStatistics(
+            dict(zip(values, np.array([*values.values()]) * noise, strict=True)), {}
+        )
 
-    def world(self: worlds.World) -> Statistics:
+    def world(self: worlds.DrawnWorld) -> SlideStatistics:
         values = {it.key: value_of(self.rig.scene, it) for it in prior.parameters}
         return of(values, np.random.default_rng(self.seed))
 
-    def reference(slides: Sequence[PilotTrial], *_: Any) -> Statistics:
+    def reference(slides: Sequence[PilotTrial], *_: Any) -> SlideStatistics:
         values = {it.key: value_of(rig.scene, it) for it in prior.parameters}
         values[FRICTION] *= friction[slides[0].trial]
         return of(values, np.random.default_rng(int(1e6 * friction[slides[0].trial])))
@@ -97,7 +99,7 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
         return found
 
     monkeypatch.setattr(worlds, "everywhere", everywhere)
-    monkeypatch.setattr(worlds.World, "statistics", world)
+    monkeypatch.setattr(worlds.DrawnWorld, "statistics", world)
     monkeypatch.setattr(drift, "statistics", reference)
     return friction
 

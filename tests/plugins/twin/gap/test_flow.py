@@ -16,12 +16,12 @@ from sliplab.analysis.study import Finding
 from sliplab.flows.judge_network import judge_model
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.planning.schema import file_schema
-from sliplab.flows.study import Outcome
+from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.twin.document import TwinGap
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_samples
 from sliplab.plugins.twin.gap import flow as gap
 from sliplab.plugins.twin.gap.study import STUDY
-from sliplab.plugins.twin.posterior import Estimate, Posterior
+from sliplab.plugins.twin.posterior import ParameterPosterior, Posterior
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
@@ -59,14 +59,17 @@ def twin_file(path: Path, extends: str = "rehearsal") -> Path:
         "mock": {"scene": {"friction": {"kinetic": 0.75}}},
     }
     names = tuple(
-        Estimate(key, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, False, ()) for key in (FRICTION, NOISE)
+        ParameterPosterior(key, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, False, ())
+        for key in (FRICTION, NOISE)
     )
     write_samples(samples_file(path), Posterior(names, np.log(SAMPLES)))
     return write(path, data)
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(
+    ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
+) -> Store:
     """A copy of the small study, which has a network of its own."""
     folder = tmp_path_factory.mktemp("gap") / "store"
     shutil.copytree(ran[0][0].store, folder)

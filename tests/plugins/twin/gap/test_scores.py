@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.analysis.evaluation.trials import Judged
+from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.analysis.metrics import classification
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.plugins.twin.gap.scores import behind, macro_f1
@@ -14,7 +14,7 @@ from sliplab.protocols.settings import Windows
 Y = np.array([0, 1, 2, 0, 1, 2])
 
 
-def judged(said: list[int], trials: tuple[str, ...] = ("a", "b")) -> Judged:
+def judged(said: list[int], trials: tuple[str, ...] = ("a", "b")) -> EvaluatedTrials:
     """A network's classes of three windows of each of two trials; 3 is undecided."""
     counts = np.zeros((len(said), 3), np.int64)
     for row, k in enumerate(said):
@@ -22,7 +22,7 @@ def judged(said: list[int], trials: tuple[str, ...] = ("a", "b")) -> Judged:
             counts[row, k] = 9
     windows, names = SampleSet.join([], Windows()).windows, tuple(("pilot", it) for it in trials)
     samples = SampleSet(windows, Y, np.repeat([0, 1], 3), np.zeros(6, np.int64), names)
-    return Judged(counts, samples, [])
+    return EvaluatedTrials(counts, samples, [])
 
 
 def test_the_difference_is_over_the_same_trials() -> None:

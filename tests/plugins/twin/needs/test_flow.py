@@ -15,7 +15,7 @@ from sliplab.plugins.twin.document import CheapestScene, EffectNeed
 from sliplab.plugins.twin.effects import EFFECTS
 from sliplab.plugins.twin.needs import flow as needs
 from sliplab.plugins.twin.needs.judging import Marks, Need, marks
-from sliplab.plugins.twin.worlds import Slides, World, guess_of, other_rig
+from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.conftest import tiny, write
@@ -28,17 +28,17 @@ TREMBLING, ROUGH = "vibration of the arm", "friction that varies along a path"
 
 
 @pytest.fixture(scope="module")
-def worlds(rig_path: Path, tmp_path_factory: pytest.TempPathFactory) -> list[World]:
+def worlds(rig_path: Path, tmp_path_factory: pytest.TempPathFactory) -> list[DrawnWorld]:
     """A twin whose arm trembles strongly, without an event camera, which takes most of the time."""
     plan = load_plan(write(tmp_path_factory.mktemp("needs") / "tiny.yaml", tiny()))
     own, _ = load_rig_file(rig_path)
     rig = changed(other_rig(own, {}, {}), {"arm": {"vibration_um": 60.0}})
     slides = Slides(plan, tuple(plan.trials[:TRIALS]), frozenset())
-    return [World(rig, slides, seed, guess_of(own)) for seed in range(WORLDS)]
+    return [DrawnWorld(rig, slides, seed, guess_of(own)) for seed in range(WORLDS)]
 
 
 @pytest.fixture(scope="module")
-def taken(worlds: list[World]) -> list[list[Marks]]:
+def taken(worlds: list[DrawnWorld]) -> list[list[Marks]]:
     return [[marks(trial) for trial in world.take()] for world in worlds]
 
 
@@ -64,7 +64,7 @@ def written(twin: Path, found: needs.Needs) -> Path:
 
 
 def test_effects_that_the_pilot_has_are_asked_for(
-    worlds: list[World], taken: list[list[Marks]], quick: None, tmp_path: Path
+    worlds: list[DrawnWorld], taken: list[list[Marks]], quick: None, tmp_path: Path
 ) -> None:
     pilot = replace(worlds[0], seed=99).take()
     found = needs.measure_needs(pilot, worlds, taken)
@@ -78,7 +78,7 @@ def test_effects_that_the_pilot_has_are_asked_for(
 
 
 def test_an_effect_that_the_pilot_lacks_is_left_out_of_the_cheapest_scene(
-    worlds: list[World], taken: list[list[Marks]], quick: None, tmp_path: Path
+    worlds: list[DrawnWorld], taken: list[list[Marks]], quick: None, tmp_path: Path
 ) -> None:
     pilot = replace(worlds[0], rig=changed(worlds[0].rig, STILL), seed=99).take()
     found = needs.measure_needs(pilot, worlds, taken)
@@ -132,7 +132,7 @@ def test_large_deflection_is_only_left_out_with_all_that_its_level_lacks() -> No
 
 
 def test_too_few_test_trials_say_nothing(
-    worlds: list[World], taken: list[list[Marks]], tmp_path: Path
+    worlds: list[DrawnWorld], taken: list[list[Marks]], tmp_path: Path
 ) -> None:
     pilot = worlds[0].take()[:2]
     found = needs.measure_needs(pilot, worlds, [world[:2] for world in taken])

@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from sliplab.plugins.twin.effects import EFFECTS, effects_of, lacking, merged
 from sliplab.plugins.twin.needs.judging import NEGLIGIBLE, Marked, crps, marked, marks, need
-from sliplab.rigs.mock.settings import EventCamera, MockSettings, Scene
+from sliplab.rigs.mock.settings import MockEventCameraSettings, MockSettings, SceneSettings
 from sliplab.storage.streams import F64
 from tests.plugins.twin.test_shown import drawn, events
 
@@ -118,7 +118,8 @@ def test_effects_that_a_scene_lacks_are_not_left_out_again() -> None:
     assert {"bandwidth", "negative", "falling"} == {effect.key for effect in lacking(own)}
     assert len(there) + 3 == len(EFFECTS) + 1
     other = MockSettings(
-        scene=Scene(step_ms=16), event_camera=EventCamera(cutoff_hz=300.0, noise_hz=0.0)
+        scene=SceneSettings(step_ms=16),
+        event_camera=MockEventCameraSettings(cutoff_hz=300.0, noise_hz=0.0),
     )
     there = {effect.key for effect in effects_of(other)}
     assert "bandwidth" in there

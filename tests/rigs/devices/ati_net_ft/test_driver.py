@@ -17,7 +17,7 @@ from sliplab.analysis.clocks.clock_bounds import fit_bounds
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.rigs.devices.ati_net_ft import rdt
 from sliplab.rigs.devices.ati_net_ft.driver import AtiNetFt
-from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt, Kind
+from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt, SensorFaultKind
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.storage.streams import WrenchChunk
 from tests.rigs.waiting import own_address, until
@@ -198,7 +198,7 @@ def test_lost_records_are_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     chunks = gather(sensor, 20)
-    fake.inject(Kind.LOSS, 7)
+    fake.inject(SensorFaultKind.LOSS, 7)
     chunks += gather(sensor, 50)
     assert sensor.counts.lost == 7
     assert np.diff(times(chunks)).max() == pytest.approx(8_000_000, abs=150_000)
@@ -208,9 +208,9 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
     chunks = gather(sensor, 20)
-    fake.inject(Kind.REORDER, 3)
+    fake.inject(SensorFaultKind.REORDER, 3)
     chunks += gather(sensor, 50)
-    fake.inject(Kind.DUPLICATE, 2)
+    fake.inject(SensorFaultKind.DUPLICATE, 2)
     chunks += gather(sensor, 50)
     assert np.all(np.diff(times(chunks)) > 0)
     assert (sensor.counts.late, sensor.counts.lost) == (5, 0)
@@ -218,14 +218,14 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
 
 def test_what_is_no_record_is_counted(make: Make) -> None:
     sensor, fake = make(rows=5)
-    fake.inject(Kind.MALFORMED, 2)
+    fake.inject(SensorFaultKind.MALFORMED, 2)
     gather(sensor, 20)
     assert (sensor.counts.malformed, sensor.counts.lost) == (2, 2)
 
 
 def test_silence_is_a_fault(make: Make) -> None:
     sensor, fake = make(rows=5)
-    fake.inject(Kind.SILENCE)
+    fake.inject(SensorFaultKind.SILENCE)
     assert "nothing came for 0.3 s" in fault_of(sensor, SILENCE_S)
     with pytest.raises(RigError, match="nothing came"):
         sensor.read()
@@ -243,13 +243,13 @@ def test_a_sensor_without_power_is_a_fault(make: Make) -> None:
 
 def test_a_saturated_sensor_is_a_fault(make: Make) -> None:
     sensor, fake = make(rows=5)
-    fake.inject(Kind.SATURATED)
+    fake.inject(SensorFaultKind.SATURATED)
     assert "0xC0000000: force or torque out of range" in fault_of(sensor, 0.5)
 
 
 def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
     sensor, fake = make(wire={"ticks": 10**6}, rows=5)
-    fake.inject(Kind.RESTART)
+    fake.inject(SensorFaultKind.RESTART)
     assert "it restarted" in fault_of(sensor, 0.5)
 
 
@@ -264,7 +264,7 @@ def test_a_sensor_that_is_not_there_is_named_within_its_bound(make: Make) -> Non
 
 def test_a_page_that_answers_without_records_is_named(make: Make) -> None:
     sensor, fake = make(connected=False)
-    fake.inject(Kind.SILENCE)
+    fake.inject(SensorFaultKind.SILENCE)
     begin = time.monotonic()
     with pytest.raises(RigError, match=r"no record from .*: none within 0.6 s"):
         sensor.connect()
@@ -273,7 +273,7 @@ def test_a_page_that_answers_without_records_is_named(make: Make) -> None:
 
 def test_a_saturated_sensor_does_not_connect(make: Make) -> None:
     sensor, fake = make(connected=False)
-    fake.inject(Kind.SATURATED)
+    fake.inject(SensorFaultKind.SATURATED)
     with pytest.raises(RigError, match="out of range; take the load off"):
         sensor.connect()
 
@@ -304,7 +304,7 @@ def test_closing_ends_the_stream_and_may_be_repeated(make: Make) -> None:
 )
 def test_a_page_that_is_none_is_named(page: bytes, said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
-        rdt.Page.parse(page)
+        rdt.ConfigurationPage.parse(page)
 
 
 @pytest.mark.parametrize(

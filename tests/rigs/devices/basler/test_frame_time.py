@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.rigs.devices.basler.frame_time import Abilities, Stamping, choose
+from sliplab.rigs.devices.basler.frame_time import Abilities, FrameStamping, choose
 
 ALL = Abilities(
     chunk=True, result=True, event=True, latch=True, sync_level=True, exposure_line=True
@@ -16,35 +16,41 @@ ALL = Abilities(
 @pytest.mark.parametrize(
     ("has", "trigger", "expected"),
     [
-        (ALL, "hardware", Stamping("chunk", "hardware trigger")),
-        (ALL, "free run", Stamping("chunk", "exposure line")),
-        (Abilities(chunk=True, latch=True), "hardware", Stamping("chunk", "device time stamps")),
+        (ALL, "hardware", FrameStamping("chunk", "hardware trigger")),
+        (ALL, "free run", FrameStamping("chunk", "exposure line")),
+        (
+            Abilities(chunk=True, latch=True),
+            "hardware",
+            FrameStamping("chunk", "device time stamps"),
+        ),
         (
             Abilities(result=True, latch=True),
             "free run",
-            Stamping("grab result", "device time stamps"),
+            FrameStamping("grab result", "device time stamps"),
         ),
         (
             Abilities(event=True, exposure_line=True),
             "free run",
-            Stamping("exposure end event", "exposure line"),
+            FrameStamping("exposure end event", "exposure line"),
         ),
-        (Abilities(event=True), "free run", Stamping("host arrival", "host arrival")),
-        (Abilities(latch=True), "free run", Stamping("host arrival", "host arrival")),
+        (Abilities(event=True), "free run", FrameStamping("host arrival", "host arrival")),
+        (Abilities(latch=True), "free run", FrameStamping("host arrival", "host arrival")),
         (
             Abilities(exposure_line=True, sync_level=True),
             "hardware",
-            Stamping("host arrival", "host arrival"),
+            FrameStamping("host arrival", "host arrival"),
         ),
-        (Abilities(chunk=True), "software", Stamping("host arrival", "host arrival")),
+        (Abilities(chunk=True), "software", FrameStamping("host arrival", "host arrival")),
     ],
 )
-def test_the_best_that_the_camera_has(has: Abilities, trigger: Any, expected: Stamping) -> None:
+def test_the_best_that_the_camera_has(
+    has: Abilities, trigger: Any, expected: FrameStamping
+) -> None:
     assert choose(has, trigger) == expected
 
 
 def test_the_middle_lies_after_a_start_and_before_an_end() -> None:
-    assert Stamping("chunk", "hardware trigger").middle_ns(1000, 30) == 1030
-    assert Stamping("grab result", "exposure line").middle_ns(1000, 30) == 1030
-    assert Stamping("exposure end event", "exposure line").middle_ns(1000, 30) == 970
-    assert Stamping("host arrival", "host arrival").middle_ns(1000, 30) == 1000
+    assert FrameStamping("chunk", "hardware trigger").middle_ns(1000, 30) == 1030
+    assert FrameStamping("grab result", "exposure line").middle_ns(1000, 30) == 1030
+    assert FrameStamping("exposure end event", "exposure line").middle_ns(1000, 30) == 970
+    assert FrameStamping("host arrival", "host arrival").middle_ns(1000, 30) == 1000

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.basler.frame_time import Stamping
+from sliplab.rigs.devices.basler.frame_time import FrameStamping
 from sliplab.rigs.devices.basler.grabbing import NO_ID, Grab, GrabSettings
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]
 LIMITS: dict[str, Any] = {"period_ns": 10_000_000, "late_ns": 100_000_000, "queue": 100}
 LIMITS |= {"mid_exposure_ns": 1000, "first_id": 0, "sync_bit": 2, "first_ns": 0, "stall_ns": 0}
-CHUNKS = GrabSettings(stamping=Stamping("chunk", "hardware trigger"), **LIMITS)
-EXPOSED = Stamping("exposure end event", "exposure line")
+CHUNKS = GrabSettings(stamping=FrameStamping("chunk", "hardware trigger"), **LIMITS)
+EXPOSED = FrameStamping("exposure end event", "exposure line")
 
 
 class Result:
@@ -114,7 +114,7 @@ def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Unti
         assert grab.counts.late == 1
 
 
-STAMPED = Stamping("grab result", "device time stamps")
+STAMPED = FrameStamping("grab result", "device time stamps")
 GIGE = changed(stamping=STAMPED, first_id=1, late_ns=10**12, sync_bit=None, queue=10**6)
 
 

@@ -17,7 +17,7 @@ from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
 from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, Sent, arrays, scene
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream, UsbCamera
-from sliplab.rigs.devices.dvxplorer.source import EventSource, check_taken, configure, in_force
+from sliplab.rigs.devices.dvxplorer.source import DvxEventSource, check_taken, configure, in_force
 from sliplab.storage.streams import I64, EventChunk
 
 pytestmark = pytest.mark.realtime
@@ -194,7 +194,7 @@ def store(*times_us: int) -> Any:
 @contextmanager
 def fed(given: Batches | None = None, **settings: Any) -> Iterator[tuple[DvxplorerCamera, Batches]]:
     batches = given or Batches()
-    source = EventSource(batches, batches, None, (640, 480), "batches")
+    source = DvxEventSource(batches, batches, None, (640, 480), "batches")
     camera = DvxplorerCamera(DvxplorerSettings(**settings), source)
     try:
         yield camera, batches

@@ -17,7 +17,7 @@ import serial
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import RigError, SyncBox
 from sliplab.rigs.core.pulse_code import code_bits
-from sliplab.rigs.devices.sync_box.driver import SerialSyncBox, Train
+from sliplab.rigs.devices.sync_box.driver import ReportTrain, SerialSyncBox
 from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
 from sliplab.rigs.devices.sync_box.line import NAME, LineReader, seal, unseal
 from sliplab.rigs.devices.sync_box.port import JOIN_S, TRIES, SyncBoxFault
@@ -508,7 +508,7 @@ def test_a_restart_in_the_middle_of_a_line_is_read() -> None:
 def test_a_garbled_report_that_passes_the_checksum_is_no_tick(
     number: int, bit: int, us: int
 ) -> None:
-    train = Train(100_000, 0b1111_1101_1111_1011, "lfsr")
+    train = ReportTrain(100_000, 0b1111_1101_1111_1011, "lfsr")
     train.first_us = 0
     train.tick(0, 1, 0)
     train.tick(2, 0, 20_000)
@@ -519,7 +519,7 @@ def test_a_garbled_report_that_passes_the_checksum_is_no_tick(
 
 def test_tick_in_the_future_is_refused() -> None:
     """All of it fits, but the ticks that follow would come too late."""
-    train = Train(100_000, 0b1111_1101_1111_1011, "lfsr")
+    train = ReportTrain(100_000, 0b1111_1101_1111_1011, "lfsr")
     train.first_us = 1000
     assert train.tick(0, 1, 1000, 5000) == 0
     bit = int(code_bits(0b1111_1101_1111_1011, 50_001, "lfsr")[50_000])
@@ -530,7 +530,7 @@ def test_tick_in_the_future_is_refused() -> None:
 
 
 def test_exposures_out_of_order_are_refused() -> None:
-    train = Train(100_000, 1, "lfsr")
+    train = ReportTrain(100_000, 1, "lfsr")
     train.first_us = 1000
     assert train.exposure(0, 900, 5000) == -100
     assert train.exposure(3, 2000, 5000) == 1000
