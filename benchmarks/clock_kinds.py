@@ -110,7 +110,7 @@ class Tally:
     def row(self) -> str:
         """One line of the table."""
         share, low, high = self.coverage
-        said = (
+        given = (
             ""
             if self.kind in HOPELESS or not self.errors.size
             else (
@@ -120,7 +120,7 @@ class Tally:
         )
         return (
             f"| {self.kind.replace('_', ' ')} | {self.fit_ms.size:,} | {self.wrong} | "
-            f"{self.wrong_anywhere} | {100 * self.refused:.2f} | {said or ' | '} | "
+            f"{self.wrong_anywhere} | {100 * self.refused:.2f} | {given or ' | '} | "
             f"{median(self.fit_ms.tolist()):.2f} |"
         )
 

@@ -108,9 +108,9 @@ def _training(
         np.save(dense, x)
 
         def ours() -> None:
-            kept = SampleSet.load(path)
+            stored = SampleSet.load(path)
             rows = np.arange(len(x))
-            parts = [kept.windows.take(part) for part in (rows[:split], rows[split:])]
+            parts = [stored.windows.take(part) for part in (rows[:split], rows[split:])]
             fit(
                 parts[0],
                 y[:split],
@@ -124,18 +124,18 @@ def _training(
 
         def theirs(module: Any, forward: Forward) -> Callable[[], None]:
             def epoch() -> None:
-                kept = np.load(dense, mmap_mode="r")
+                stored = np.load(dense, mmap_mode="r")
                 optimizer = torch.optim.Adam(module.parameters(), lr=training.learning_rate)
                 order = np.random.default_rng(SEED).permutation(split)
                 for start in range(0, split, BATCH):
                     rows = order[start : start + BATCH]
-                    out = forward(torch.from_numpy(kept[rows].astype(np.float32)))
+                    out = forward(torch.from_numpy(stored[rows].astype(np.float32)))
                     loss = nn.functional.cross_entropy(out, torch.from_numpy(y[rows]))
                     optimizer.zero_grad()
                     loss.backward()
                     optimizer.step()
                 with torch.no_grad():
-                    forward(torch.from_numpy(kept[split:].astype(np.float32)))
+                    forward(torch.from_numpy(stored[split:].astype(np.float32)))
 
             return epoch
 

@@ -203,10 +203,10 @@ def _drained(run_id: str, count: int) -> None:
     from prefect.settings import temporary_settings
 
     end = time.monotonic() + DRAIN_LIMIT_S
-    kept = 0
+    retained = 0
     with temporary_settings(embedded().settings()), get_client(sync_client=True) as client:
         while time.monotonic() < end:
-            kept = client.request("POST", "/task_runs/count", json=wanted).json()
-            if kept >= count:
+            retained = client.request("POST", "/task_runs/count", json=wanted).json()
+            if retained >= count:
                 return
-    raise RuntimeError(f"the server keeps {kept} of {count} task runs")
+    raise RuntimeError(f"the server keeps {retained} of {count} task runs")

@@ -211,12 +211,12 @@ def main() -> None:
     print(HEAD)
     print("|" + " --- |" * 9)
     if asked.bank:
-        kept = dict(np.load(asked.bank))
-        names = tuple(map(str, kept["parameters"])), tuple(map(str, kept["statistics"]))
-        bounds = kept["lower"], kept["upper"]
-        k = len(kept["theta"]) - asked.hidden
+        stored = dict(np.load(asked.bank))
+        names = tuple(map(str, stored["parameters"])), tuple(map(str, stored["statistics"]))
+        bounds = stored["lower"], stored["upper"]
+        k = len(stored["theta"]) - asked.hidden
         bank, hidden = (
-            Bank(*names, kept["theta"][part], kept["s"][part], *bounds)
+            Bank(*names, stored["theta"][part], stored["s"][part], *bounds)
             for part in (slice(None, k), slice(k, None))
         )
         compared(asked.bank.stem, [(bank, hidden)])

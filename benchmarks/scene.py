@@ -161,8 +161,8 @@ def _first_second(rows: tuple[I64, F64]) -> tuple[I64, F64]:
     """The rows of a hold and slide that are within a second after the hold."""
     t_ns, loads = rows
     begin_ns = t_ns[0] + HOLD_S * 1e9
-    kept = (t_ns >= begin_ns) & (t_ns <= begin_ns + 1e9)
-    return t_ns[kept], np.ascontiguousarray(loads[kept])
+    retained = (t_ns >= begin_ns) & (t_ns <= begin_ns + 1e9)
+    return t_ns[retained], np.ascontiguousarray(loads[retained])
 
 
 def _against_v2e(runs: int, silent: MarkerSensor, rows: tuple[I64, F64]) -> Figures:

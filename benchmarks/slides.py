@@ -39,9 +39,9 @@ def loads_of_slide(
     """Times (ns) and forces on every tip at every row of a hold and slide, (m,) and (m, 3 n)."""
     devices = build_mock(settings)
     press(devices, length_mm, finer)
-    kept = devices.world.keep_loads()
+    stored = devices.world.keep_loads()
     hold_and_slide(devices, length_mm, events=False, speed_mm_s=speed_mm_s)
-    t_ns, loads = kept.between(kept.begin_ns, kept.end_ns)
+    t_ns, loads = stored.between(stored.begin_ns, stored.end_ns)
     return t_ns.copy(), loads.copy()
 
 

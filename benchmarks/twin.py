@@ -215,21 +215,21 @@ def taken(
     jobs: Sequence[WorldJob], file: Path | None, cores: int
 ) -> dict[str, list[dict[str, Any]]]:
     """Return what worlds show by kind; those that the file has are not simulated again."""
-    kept: dict[WorldJob, dict[str, Any]] = {}
+    retained: dict[WorldJob, dict[str, Any]] = {}
     if file is not None and file.exists():
         for line in file.read_text().splitlines():
             row = json.loads(line)
-            kept[WorldJob(row["kind"], row["number"], row["seed"])] = row
-    missing = sorted((job for job in jobs if job not in kept), key=lambda job: job.number)
+            retained[WorldJob(row["kind"], row["number"], row["seed"])] = row
+    missing = sorted((job for job in jobs if job not in retained), key=lambda job: job.number)
     with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
         for job, row in zip(missing, pool.map(shown_by, missing), strict=True):
-            kept[job] = row
+            retained[job] = row
             if file is not None:
                 with file.open("a") as lines:
                     lines.write(json.dumps(row) + "\n")
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for job in jobs:
-        found[job.kind].append(kept[job])
+        found[job.kind].append(retained[job])
     return found
 
 
@@ -302,9 +302,9 @@ def called(bank: Bank, observed: F64, truths: F64) -> Worlds:
         key = usable.tobytes()
         if key not in fits:
             fits[key] = fitted(bank, usable)
-        said = fits[key].at(seen)
-        ranks = (said.samples < truth).mean(axis=0)
-        found.append(tuple(map(CalledEstimate, said.estimates, truth.tolist(), ranks.tolist())))
+        stated = fits[key].at(seen)
+        ranks = (stated.samples < truth).mean(axis=0)
+        found.append(tuple(map(CalledEstimate, stated.estimates, truth.tolist(), ranks.tolist())))
     return found
 
 

@@ -199,15 +199,15 @@ def calibrated(asked: argparse.Namespace, folder: Path, hidden: Path) -> Path:
         return twin
     pilot = make_request(shipped("pilot", folder), hidden, folder / "pilot")
     store, (item,) = retake([pilot])
-    kept = store.folder / "derived/scene-worlds"
-    copytree(worlds, kept, dirs_exist_ok=True)
+    retained = store.folder / "derived/scene-worlds"
+    copytree(worlds, retained, dirs_exist_ok=True)
     try:
         fitting = prior_of(BANK, asked.seed)
         wanted = request(assumed, twin, asked.bank, fitting.spread, fitting.seed)
         fitted = calibrate_scene(store, item, replace(wanted, needs=False))
         STUDY.write(finding(twin, *fitted))
     finally:
-        copytree(kept, worlds, dirs_exist_ok=True)
+        copytree(retained, worlds, dirs_exist_ok=True)
     return twin
 
 
@@ -454,15 +454,15 @@ def tables(worlds: Mapping[int, Mapping[str, Any]]) -> Iterator[str]:
     for number, studies in worlds.items():
         own = studies["hidden"]["figures"]
         for name, study in studies.items():
-            found, said = study["figures"], ""
+            found, stated = study["figures"], ""
             cells = ["-" if found[key] is None else f"{found[key]:.1f}" for key in known]
             if name != "hidden":
                 near_by = within(own, found)
                 held = {key: near_by[key] for key in known}
                 near.setdefault(name, []).append(held)
                 far.setdefault(name, []).append(beyond(study["spans"]))
-                said = f"{sum(held.values())} of {len(held)}"
-            yield f"| {number} | {name} | {' | '.join(cells)} | {said} |"
+                stated = f"{sum(held.values())} of {len(held)}"
+            yield f"| {number} | {name} | {' | '.join(cells)} | {stated} |"
     for title, counted, every in (
         (f"within {POINTS:g} point, or {100 * SHARE:g} %", near, "all"),
         ("whole 95 % interval beyond that", far, "none"),
@@ -495,8 +495,8 @@ def main() -> None:
     files = protocols(asked.folder, asked.networks, asked.whole_grid)
     hidden_networks = asked.networks * (2 if asked.again else 1)
     hidden_files = protocols(asked.folder / "hidden", hidden_networks, asked.whole_grid)
-    kept = asked.folder / "rows.json"
-    rows = read_json(kept)["rows"] if kept.exists() else []
+    retained = asked.folder / "rows.json"
+    rows = read_json(retained)["rows"] if retained.exists() else []
     assumed = studied(asked.folder / "assumed.yaml", files, asked.folder / "assumed")
     usual = assumed.outcomes(assumed.networks)
     for number in range(asked.first, asked.first + asked.worlds):
@@ -507,7 +507,7 @@ def main() -> None:
         except RigError as error:
             print(f"world {number} cannot be collected: {error}")
             continue
-        write_json(kept, {"simulated": True, "rows": rows})
+        write_json(retained, {"simulated": True, "rows": rows})
     print("\n".join(lines(rows)))
 
 

@@ -121,9 +121,9 @@ def _explain(error: Exception) -> int:
 
 def _fail(message: str, code: int) -> int:
     """Report in one line an error before or after normal error reporting is available."""
-    said = message if code == 130 else f"error: {message}"
+    stated = message if code == 130 else f"error: {message}"
     with suppress(OSError):
-        os.write(2, f"{said}\n".encode(errors="backslashreplace"))
+        os.write(2, f"{stated}\n".encode(errors="backslashreplace"))
     console = sys.modules.get("sliplab.flows.running.console")
     if "--json" in sys.argv[1:] and not (console and console.printed()):
         known = {"file": None, "key": None, "value": None, "message": message, "exit_code": code}

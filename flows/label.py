@@ -121,10 +121,10 @@ def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> StepR
     label(store, campaigns)
     made_of = [recording.checksum for _, recording in campaigns[0].trials]
     key = make_key(CHECK, CHECK_VERSION, [made_of, labelling.VERSION], None)
-    kept = Derived.of(Store.open(run_request.store), CHECK)
-    stale = not kept.fresh(CHECK, key)
+    stored = Derived.of(Store.open(run_request.store), CHECK)
+    stale = not stored.fresh(CHECK, key)
     if stale:
         figures = rules_compared(store, campaigns)
         found = LabelCheck(trials=len(made_of), simulated=True, rules_ms=figures)
-        kept.write(CHECK, key, found)
+        stored.write(CHECK, key, found)
     return {"step": CHECK, "done": taken or int(stale), "fresh": len(made_of) - taken}

@@ -110,11 +110,11 @@ def _write_page(
     quarantined = [[item.name, item.campaign.quarantined()] for item in campaigns]
     shown = [[work.campaign, work.key] for work in required]
     key = make_key(SYNC, PAGE_VERSION, [shown, quarantined], None)
-    kept = Derived.of(store, SYNC)
-    if not kept.fresh("page", key) or not path.exists():
+    stored = Derived.of(store, SYNC)
+    if not stored.fresh("page", key) or not path.exists():
         path.parent.mkdir(exist_ok=True)
         write_text(path, render(campaigns, trials, simulated=store.simulated))
-        kept.write("page", key, {})
+        stored.write("page", key, {})
     return path
 
 

@@ -68,9 +68,9 @@ def window_baselines(
     methods = baselines.class_methods(campaigns) if classes else baselines.slip_methods()
     of, make = methods.prefix, load_class_samples if classes else load_samples
     train, validation, test = map(partial(make, StoreLabels(store, reviewed), campaigns), SPLITS)
-    kept = Derived.of(store, baselines.STEP)
+    stored = Derived.of(store, baselines.STEP)
     keys = {name: methods.key(store, name) for name in methods.names}
-    stale = [name for name, key in keys.items() if not kept.fresh(f"{of}{name}", key)]
+    stale = [name for name, key in keys.items() if not stored.fresh(f"{of}{name}", key)]
     if stale:
         with timed(store, "baselines"):
             for name in stale:
@@ -83,13 +83,13 @@ def window_baselines(
                     console.say(f"warning: {name} is left out: {error}")
                     continue
                 result = BaselineResult(made=made, argmax=metrics.accuracy(votes, test.y).argmax)
-                kept.write(f"{of}{name}", keys[name], result, {"votes": votes})
-    there = [name for name, key in keys.items() if kept.fresh(f"{of}{name}", key)]
+                stored.write(f"{of}{name}", keys[name], result, {"votes": votes})
+    there = [name for name, key in keys.items() if stored.fresh(f"{of}{name}", key)]
     return {
         "step": "baselines",
         "done": len(set(stale).intersection(there)),
         "fresh": len(keys) - len(stale),
-        "argmax": {name: kept.load(f"{of}{name}", BaselineResult).argmax for name in there},
+        "argmax": {name: stored.load(f"{of}{name}", BaselineResult).argmax for name in there},
     }
 
 

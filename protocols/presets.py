@@ -73,9 +73,9 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     found = dict(data)
     for each in PAPER if data.get("preset") == "paper" else ():
         section, key = each.key.split(".")
-        said = found.get(section, {})
-        if isinstance(said, dict):
-            found[section] = {key: each.value, **said}
+        stated = found.get(section, {})
+        if isinstance(stated, dict):
+            found[section] = {key: each.value, **stated}
     return found
 
 

@@ -367,8 +367,8 @@ class AnalysisSettings(StrictModel):
             margin: the lead in its spikes where none is set here.
         """
         factor = outputs_per_class / self.network.outputs_per_class
-        said = "margin" in self.detection.model_fields_set
-        margin = self.detection.margin * factor if said else margin
+        stated = "margin" in self.detection.model_fields_set
+        margin = self.detection.margin * factor if stated else margin
         grid = tuple(each * factor for each in self.detection.margin_grid)
         return self.detection.model_copy(update={"margin": margin, "margin_grid": grid})
 

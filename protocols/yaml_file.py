@@ -621,8 +621,8 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     loc, kind, context = item["loc"], item["type"], item.get("ctx", {})
     key = f".{_key(loc)}" if loc else ""
     if loc and loc[-1] == "[key]":  # pydantic's placeholder for the name of an entry
-        said = re.sub("^Value error, |^[A-Z].* should", "", item["msg"]).strip()
-        return KeyedError(f".{_key(loc[:-1])}", None, f"is no right name: {said}")
+        stated = re.sub("^Value error, |^[A-Z].* should", "", item["msg"]).strip()
+        return KeyedError(f".{_key(loc[:-1])}", None, f"is no right name: {stated}")
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
         return KeyedError.joined(
             each.with_key(key + each.key) if each.below else each

@@ -323,17 +323,17 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
         RigError: a frame camera cannot record the region that the rig file says, or another device
             differs from what the file says of it.
     """
-    said: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
+    stated: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
     if isinstance(stream, EventStream):
-        said["size_px"] = (device.width, device.height)
-        return FurtherEvents(name, device, StreamRecord(**said))
+        stated["size_px"] = (device.width, device.height)
+        return FurtherEvents(name, device, StreamRecord(**stated))
     if isinstance(stream, FrameStream):
         device.set_region(*stream.region_px)
-        said["size_px"], said["px_per_mm"] = stream.region_px, stream.scale_px_per_mm
-        said["mid_exposure_ns"] = device.mid_exposure_ns
+        stated["size_px"], stated["px_per_mm"] = stream.region_px, stream.scale_px_per_mm
+        stated["mid_exposure_ns"] = device.mid_exposure_ns
         if stream.rate_hz is not None:
-            said["rate_hz"] = stream.rate_hz
-        return FurtherFrames(name, device, StreamRecord(**said))
+            stated["rate_hz"] = stream.rate_hz
+        return FurtherFrames(name, device, StreamRecord(**stated))
     if isinstance(stream, ForceStream):
         if device.grade != stream.timing.grade:
             text = (
@@ -342,11 +342,11 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
             )
             raise RigError(f"{name} (force sensor)", text)
         matrix = plate.force_matrix(device.mounting)
-        return FurtherForces(name, device, StreamRecord(**said, to_plate=matrix))
+        return FurtherForces(name, device, StreamRecord(**stated, to_plate=matrix))
     if device.unit != stream.unit:
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)
-    return FurtherScalars(name, device, StreamRecord(**said, unit=stream.unit))
+    return FurtherScalars(name, device, StreamRecord(**stated, unit=stream.unit))
 
 
 def plate_limits(file: RigFile) -> PlateLimits:
@@ -371,12 +371,12 @@ def _force_sensor(file: RigFile, devices: DeviceSettings, arm: Arm) -> ForceSens
     if driver is None or devices.force_sensor is None:
         return None
     sensor = driver.build(devices.force_sensor, arm)
-    said = (file.timing.force or ForceTiming()).grade
-    if sensor.grade != said:
+    stated = (file.timing.force or ForceTiming()).grade
+    if sensor.grade != stated:
         raise RigError(
             "force sensor",
             f"its times are of the grade '{sensor.grade}', and the rig file says "
-            f"timing.force.grade: {said}; write timing.force: {{grade: {sensor.grade}}}",
+            f"timing.force.grade: {stated}; write timing.force: {{grade: {sensor.grade}}}",
         )
     return sensor
 

@@ -30,7 +30,7 @@ class Written:
     """The written file, and the copy of the previous one."""
 
     path: Path
-    kept: Path | None
+    retained: Path | None
 
 
 def writable_target(rig: Path, out: Path | None) -> Path:
@@ -92,9 +92,9 @@ def write_entries(
         text = source.text  # in another folder, `extends` would not find its file
     new = edited(text, changes, remove)
     _check(rig, target, new)
-    kept = _keep(target, today) if target.exists() else None
+    retained = _keep(target, today) if target.exists() else None
     write_text(target, new)
-    return Written(target, kept)
+    return Written(target, retained)
 
 
 def edited(text: str, changes: Mapping[str, Any], remove: Sequence[str] = ()) -> str:

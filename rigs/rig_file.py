@@ -498,10 +498,10 @@ def same_rig(one: str, other: str) -> bool:
 
 def _lasting(data: dict[str, Any]) -> dict[str, Any]:
     """Return what must stay the same during a campaign of a rig file's data."""
-    kept = without_secrets(data)
-    if isinstance(kept.get("mock"), dict):
-        kept["mock"].pop("faults", None)
-    return without_taught(kept)
+    retained = without_secrets(data)
+    if isinstance(retained.get("mock"), dict):
+        retained["mock"].pop("faults", None)
+    return without_taught(retained)
 
 
 def _check_exposure(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:

@@ -46,11 +46,11 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def _folder(module: str) -> Path:
     """Return the folder of a module's kernels; those of its earlier versions are deleted."""
     file = Path(str(sys.modules[module].__file__))
-    beside, said = file.parent / "__pycache__", os.environ.get("NUMBA_CACHE_DIR")
-    if not said and not os.access(beside if beside.exists() else file.parent, os.W_OK):
-        said = os.path.expanduser(_USER)
-    base = Path(said) if said else beside
-    name = f"{module}-" if said else f"{file.stem}-"
+    beside, stated = file.parent / "__pycache__", os.environ.get("NUMBA_CACHE_DIR")
+    if not stated and not os.access(beside if beside.exists() else file.parent, os.W_OK):
+        stated = os.path.expanduser(_USER)
+    base = Path(stated) if stated else beside
+    name = f"{module}-" if stated else f"{file.stem}-"
     folder = base / f"kernels-{name}{_stamp(module)}"
     if not folder.exists():
         for old in base.glob(f"kernels-{name}*"):

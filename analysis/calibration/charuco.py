@@ -153,18 +153,18 @@ def fit_lens(views: Sequence[Corners], board: Board, size_px: tuple[int, int]) -
             f"{len(used)} of {len(views)} pictures show at least {LEAST_CORNERS} corners, "
             f"{LEAST_VIEWS} are needed"
         )
-    kept = [views[i] for i in used]
-    cover = _cover(kept, size_px)
+    retained = [views[i] for i in used]
+    cover = _cover(retained, size_px)
     if cover < LEAST_COVER:
         raise BoardError(
             f"corners were seen in {100 * cover:.0f} % of the picture, at least "
             f"{100 * LEAST_COVER:.0f} % is needed: hold the board into every corner of it"
         )
     places = np.asarray(board.opencv().getChessboardCorners(), np.float64)
-    objects = [places[view.ids].astype(np.float32) for view in kept]
-    pixels = [view.px.astype(np.float32) for view in kept]
+    objects = [places[view.ids].astype(np.float32) for view in retained]
+    pixels = [view.px.astype(np.float32) for view in retained]
     fits = {name: _fit(objects, pixels, size_px, flags) for name, flags in _MODELS.items()}
-    model = _fewest(fits, sum(len(view) for view in kept))
+    model = _fewest(fits, sum(len(view) for view in retained))
     matrix, distortion, turns, shifts, doubts, residuals = fits[model]
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     lean = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max())
@@ -181,7 +181,7 @@ def fit_lens(views: Sequence[Corners], board: Board, size_px: tuple[int, int]) -
             "about both axes"
         )
     scale, tilt = _on_plane(matrix, distortion, turns[0], shifts[0], size_px)
-    weights = np.array([len(view) for view in kept], np.float64)
+    weights = np.array([len(view) for view in retained], np.float64)
     total = float(np.sqrt((weights * residuals**2).sum() / weights.sum()))
     return LensFit(
         matrix, distortion, model, scale, tilt, total, residuals, cover, doubt, np.array(used)

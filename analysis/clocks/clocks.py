@@ -285,8 +285,8 @@ def _train(times: Ints, name: str) -> Ints:
 def _differences(times: Ints, origin: int) -> Floats:
     """Float differences to `origin`; a stray stamp too far away to be subtracted is left out."""
     near = (times >= max(origin - 2**52, -(2**63))) & (times <= min(origin + 2**52, 2**63 - 1))
-    kept: Floats = (times[near] - origin).astype(np.float64)
-    return kept
+    retained: Floats = (times[near] - origin).astype(np.float64)
+    return retained
 
 
 def _extended(line: ClockLine, x: Floats) -> Floats:
@@ -354,18 +354,19 @@ def _gate_lossy(
     shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
     if max(shares) >= MIN_EITHER:
         return
-    said = f"{shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses match"
+    stated = f"{shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses match"
     if i.size < MIN_LOSSY:
         raise ClockRefused(
             "no_match",
-            f"{said}; at least {MIN_EITHER:.0%} of either must, or {MIN_LOSSY} pulses, and these "
+            f"{stated}; at least {MIN_EITHER:.0%} of either must, or {MIN_LOSSY} pulses, and these "
             f"are {i.size}: {SAME_TRIAL}",
         )
     uneven = min(unevenness(i), unevenness(j))
     if uneven > UNEVEN:
         raise ClockRefused(
             "no_match",
-            f"{said}, and the shares before and after some moment differ by {uneven:.1f} standard "
+            f"{stated}, and the shares before and after some moment differ by {uneven:.1f} "
+            "standard "
             f"deviations (at most {UNEVEN:g}): a clock jumped by whole ticks; {UNDISTURBED}",
         )
     if slack_ns > MOST_SLACK * tick:
@@ -374,7 +375,7 @@ def _gate_lossy(
     if chance < JUMP_CHANCE:
         raise ClockRefused(
             "no_match",
-            f"{said}, and on one side of some moment more would {abs(jump)} ticks away, which "
+            f"{stated}, and on one side of some moment more would {abs(jump)} ticks away, which "
             f"happens by chance with a probability of {chance:.1g} at most (at least "
             f"{JUMP_CHANCE:g} is needed): a clock jumped by whole ticks; {UNDISTURBED}",
         )

@@ -310,11 +310,11 @@ def changes(
             if edge <= 8:
                 at_end = used == edge
                 # the line has taken the rest of a step at an end
-                kept = edge * left / (sum_0 if at_end else all_weights - sum_0)
+                retained = edge * left / (sum_0 if at_end else all_weights - sum_0)
                 mean = clipped if at_end else clipped - all_clipped
-                high = abs(mean) / np.sqrt(kept)
+                high = abs(mean) / np.sqrt(retained)
                 if high > tail:
-                    tail, tail_size, tail_at = high, mean / kept, j
+                    tail, tail_size, tail_at = high, mean / retained, j
         if not whole or used_in_piece < apart or in_piece[p] - used_in_piece < apart:
             continue
         left, rest = sum_2 - 2.0 * t * sum_1 + t * t * sum_0, rest_1 - t * rest_0

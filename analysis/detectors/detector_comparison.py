@@ -193,10 +193,10 @@ def compare(
 def thinned(trial: TrialWithSlip, every: int) -> TrialWithSlip:
     """A trial with each `every`-th of its windows, the first one among them."""
     predictions = trial.predictions
-    kept = Predictions(
+    retained = Predictions(
         predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
     )
-    return replace(trial, predictions=kept)
+    return replace(trial, predictions=retained)
 
 
 def tuned(

@@ -476,7 +476,7 @@ class LiveDetector:
         window = self._opened(number, start_us)
         del self._open[number]
         counts = self._counts(window.x)[0]
-        said = self._rule.step(counts, window.events)
+        stated = self._rule.step(counts, window.events)
         self._next = number + 1
         self._judged_us = start_us + self._length_us
         a, b, c = counts.tolist()
@@ -485,9 +485,9 @@ class LiveDetector:
             start_us=start_us,
             end_us=self._judged_us,
             counts=(a, b, c),
-            smoothed=said.smoothed,
-            valid_class=said.valid_class,
-            onset=said.onset,
+            smoothed=stated.smoothed,
+            valid_class=stated.valid_class,
+            onset=stated.onset,
             events=window.events,
             last_event_us=window.last_us,
             by_event=by_event,

@@ -70,22 +70,22 @@ class Methods:
 
     def key(self, store: Store, name: str) -> str:
         """Return the key of results on the samples in the store."""
-        kept = Derived.of(store, SAMPLES)
-        parts = [kept.key(f"{self.prefix}{split}") for split in ("train", "validation", "test")]
+        saved = Derived.of(store, SAMPLES)
+        parts = [saved.key(f"{self.prefix}{split}") for split in ("train", "validation", "test")]
         return make_key(STEP, VERSION, parts, [name, self.names[name]])
 
     def fresh_keys(self, store: Store) -> list[str]:
         """Keys of the baselines that are there and belong to today's samples."""
-        kept = Derived.of(store, STEP)
+        saved = Derived.of(store, STEP)
         keys = {name: self.key(store, name) for name in self.names}
-        return [key for name, key in keys.items() if kept.fresh(f"{self.prefix}{name}", key)]
+        return [key for name, key in keys.items() if saved.fresh(f"{self.prefix}{name}", key)]
 
     def results(self, store: Store) -> dict[str, TrainedBaseline]:
         """Compare each baseline in the store with the network, by name; see `compared`.
 
         A network's figures of other windows than the baseline's are not compared.
         """
-        kept = Derived.of(store, STEP)
+        saved = Derived.of(store, STEP)
         evaluated = Derived.of(store, EVALUATION).key(self.evaluation)
         network = window_scores.kept_counts(store, evaluated, self.prefix)
         found: dict[str, TrainedBaseline] = {}
@@ -93,13 +93,13 @@ class Methods:
             return found
         for name in self.names:
             stored = f"{self.prefix}{name}"
-            if not kept.fresh(stored, self.key(store, name)):
+            if not saved.fresh(stored, self.key(store, name)):
                 continue
-            votes = kept.arrays(stored)["votes"]
+            votes = saved.arrays(stored)["votes"]
             if len(votes) != len(network["y"]):
                 continue
             row = window_scores.compared(votes, network["counts"], network["y"], network["trial"])
-            found[name] = TrainedBaseline(**dict(row), made=kept.load(stored, BaselineResult).made)
+            found[name] = TrainedBaseline(**dict(row), made=saved.load(stored, BaselineResult).made)
         return found
 
 
@@ -143,7 +143,7 @@ def train_baseline(
             validated = f"validation {100 * strict:.1f} %"
             say(f"{name}: seed {seed}, epoch {epoch} of {methods.epochs}, {validated}")
 
-        net, said = fitted_net(
+        net, stated = fitted_net(
             name,
             train,
             validation,
@@ -153,11 +153,11 @@ def train_baseline(
             classes=classes,
             batch=methods.batch,
         )
-        runs.append((net_votes(net, test.windows, classes), said))
+        runs.append((net_votes(net, test.windows, classes), stated))
     shares = [metrics.accuracy(votes, test.y).argmax for votes, _ in runs]
     each = [
-        {"seed": seed, "validation_strict": said["validation_strict"], "argmax": share}
-        for seed, (_, said), share in zip(SEEDS, runs, shares, strict=True)
+        {"seed": seed, "validation_strict": stated["validation_strict"], "argmax": share}
+        for seed, (_, stated), share in zip(SEEDS, runs, shares, strict=True)
     ]
-    votes, said = max(runs, key=lambda run: float(run[1]["validation_strict"]))
-    return votes, {**said, "seeds": each}
+    votes, stated = max(runs, key=lambda run: float(run[1]["validation_strict"]))
+    return votes, {**stated, "seeds": each}

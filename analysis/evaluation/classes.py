@@ -91,14 +91,14 @@ def class_evaluation_of(store: Store) -> ClassEvaluation:
     Raises:
         StoreError: it does not exist, or another version of the program made it.
     """
-    kept = Derived.of(store, STEP)
-    if kept.key(NAME) is None:
+    stored = Derived.of(store, STEP)
+    if stored.key(NAME) is None:
         raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
-    if kept.read(NAME).get("version") != VERSION:
+    if stored.read(NAME).get("version") != VERSION:
         raise StoreError(
             f"{store.folder}: evaluated by another version of this program; run `sliplab evaluate`"
         )
-    return kept.load(NAME, ClassEvaluation)
+    return stored.load(NAME, ClassEvaluation)
 
 
 def evaluate_classes(job: ClassJob, parts: Mapping[str, SampleSet]) -> None:
@@ -229,7 +229,7 @@ def _by_class(
 ) -> tuple[ClassScore, ...]:
     test = parts["test"]
     each = {name: np.bincount(part.y, minlength=len(classes)) for name, part in parts.items()}
-    said = confusion.sum(axis=0)
+    stated = confusion.sum(axis=0)
     rows = []
     for k, name in enumerate(classes):
         there = test.y == k
@@ -237,7 +237,7 @@ def _by_class(
             ClassScore(
                 name=name,
                 recall=window_groups.share(hits[there], test.trial[there]),
-                precision=int(confusion[k, k]) / int(said[k]) if said[k] else None,
+                precision=int(confusion[k, k]) / int(stated[k]) if stated[k] else None,
                 windows=_part_numbers({split: int(each[split][k]) for split in SPLITS}),
             )
         )

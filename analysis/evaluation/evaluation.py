@@ -128,14 +128,14 @@ def evaluation_of(store: Store) -> Evaluation:
     Raises:
         StoreError: it does not exist, or another version of the program made it.
     """
-    kept = Derived.of(store, STEP)
-    if kept.key(NAME) is None:
+    saved = Derived.of(store, STEP)
+    if saved.key(NAME) is None:
         raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
-    if kept.read(NAME).get("format") != list(FORMAT):
+    if saved.read(NAME).get("format") != list(FORMAT):
         raise StoreError(
             f"{store.folder}: evaluated by another version of this program; run `sliplab evaluate`"
         )
-    return kept.load(NAME, Evaluation)
+    return saved.load(NAME, Evaluation)
 
 
 def _score_trials(

@@ -160,8 +160,8 @@ def make_marker_job(
     chosen = margin is None and smoothing is None
     detection, inputs = {}, []
     for item in campaigns:
-        said = item.settings.detection
-        by = "test" if said.choose == "test" else "validation"
+        stated = item.settings.detection
+        by = "test" if stated.choose == "test" else "validation"
         change = {
             "smoothing": SMOOTHING if smoothing is None else smoothing,
             "margin": MARGIN if margin is None else margin,
@@ -171,7 +171,7 @@ def make_marker_job(
             "smoothing_grid": SMOOTHINGS,
             "margin_grid": MARGINS,
         }
-        detection[item.name] = Detection.model_validate({**said.model_dump(), **change})
+        detection[item.name] = Detection.model_validate({**stated.model_dump(), **change})
         for trial, recording in item.trials:
             if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
@@ -282,8 +282,8 @@ def _score_windows(job: MarkerJob, net: MarkerNet, margin: float) -> WindowScore
     points = net.points(test.x)
     hits = window_groups.strict_hits(points, test.y)
     by_tenth, no_slip = phases(labels, known, test.newest_ns, test.y, trial, hits)
-    kept = Derived.of(labels.store, WINDOWS)
-    kept.write(
+    stored = Derived.of(labels.store, WINDOWS)
+    stored.write(
         WINDOWS_NAME,
         job.key,
         {},

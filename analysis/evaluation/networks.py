@@ -75,8 +75,8 @@ class OtherNetwork:
     @cached_property
     def key(self) -> str:
         """Hash of the file and the engine, on which its counts depend."""
-        said = None if self.description is None else self.description.model_dump(mode="json")
-        return hash_data([self.content.hex(), said, self.engine])
+        stated = None if self.description is None else self.description.model_dump(mode="json")
+        return hash_data([self.content.hex(), stated, self.engine])
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def data_key(labels: StoreLabels, campaigns: list[Collected]) -> str:
     return make_key(STEP, VERSION, inputs, training_settings(campaigns).samples.model_dump())
 
 
-def kept(
+def retained(
     store: Store, campaigns: list[Collected], reviewed: bool = False
 ) -> dict[str, OtherEvaluation]:
     """Results on the trials and labels of today, by name."""

@@ -175,8 +175,8 @@ def latencies(
             x, end_ns = dataset.trial_windows(recording, fitted.windows)
             both = fast.counts(x), chip_run(chip, x.dense()).counts
             for rows, counts in zip(found, both, strict=True):
-                said = detect(counts, end_ns, rule)
-                scored = score_trial(said, slip, round(rule.false_early_ms * 1e6))
+                stated = detect(counts, end_ns, rule)
+                scored = score_trial(stated, slip, round(rule.false_early_ms * 1e6))
                 rows.setdefault(item.experiment, []).append(scored)
     real, chips = map(_summary, found)
     return real, chips

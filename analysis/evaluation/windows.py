@@ -228,8 +228,8 @@ def kept_counts(
     Args:
         of: prefix of the name that they are stored under.
     """
-    kept, name = Derived.of(store, STEP), f"{of}{NAME}"
-    return kept.arrays(name) if evaluated is not None and kept.fresh(name, evaluated) else None
+    saved, name = Derived.of(store, STEP), f"{of}{NAME}"
+    return saved.arrays(name) if evaluated is not None and saved.fresh(name, evaluated) else None
 
 
 def window_intervals(store: Store, evaluated: str | None) -> WindowIntervals | None:
@@ -248,8 +248,8 @@ def intervals_of(
     counts: npt.NDArray[np.int64], y: npt.NDArray[np.int64], trial: npt.NDArray[np.int64]
 ) -> WindowIntervals:
     """The same of counts (n, 3) with their classes (n,) and trials (n,)."""
-    said = metrics.winners(counts)
-    true, called = y == metrics.INCIPIENT, said == metrics.INCIPIENT
+    stated = metrics.winners(counts)
+    true, called = y == metrics.INCIPIENT, stated == metrics.INCIPIENT
     both = (true & called).astype(np.float64)
     return WindowIntervals(
         accuracy=window_groups.share(window_groups.credit(counts, y), trial),

@@ -110,8 +110,8 @@ def match_layout(
     for _ in range(3):
         apart = np.hypot(*np.moveaxis(xy[None] - layout_px[:, None] - shift, -1, 0))
         rows, columns = linear_sum_assignment(np.where(apart < tolerance_px, apart, 1e6))
-        kept = apart[rows, columns] < tolerance_px
-        rows, columns = rows[kept], columns[kept]
+        retained = apart[rows, columns] < tolerance_px
+        rows, columns = rows[retained], columns[retained]
         if len(rows) == 0:
             break
         shift = np.median(xy[columns] - layout_px[rows], axis=0)

@@ -215,5 +215,5 @@ def _last_other(times: list[int | None], centre: int) -> int | None:
 
 def read_check(store: Store) -> LabelCheck | None:
     """Return the figures of the last check; None if there is none."""
-    kept = Derived.of(store, CHECK)
-    return kept.load(CHECK, LabelCheck) if kept.key(CHECK) is not None else None
+    stored = Derived.of(store, CHECK)
+    return stored.load(CHECK, LabelCheck) if stored.key(CHECK) is not None else None

@@ -35,14 +35,14 @@ def front(costs: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
         raise ValueError(f"costs of row {int(np.isnan(costs).any(axis=1).argmax())} hold a NaN")
     n, k = costs.shape
     on = np.zeros(n, np.bool_)
-    kept = np.empty((n, k))
+    retained = np.empty((n, k))
     count = 0
     # the last key sorts first: by the first objective, ties by the next ones
     for row in np.lexsort(costs.T[::-1]).tolist():
-        cost, best = costs[row], kept[:count]
+        cost, best = costs[row], retained[:count]
         beaten = (best <= cost).all(axis=1) & (best < cost).any(axis=1)
         if not beaten.any():
             on[row] = True
-            kept[count] = cost
+            retained[count] = cost
             count += 1
     return on

@@ -98,11 +98,11 @@ def expected_calibration_error(
     Windows are put by their highest probability into bins of equal width. Where classes tie, each
     has its share of being right, so that the order of classes does not matter.
     """
-    said = probabilities.max(axis=1)
-    top = probabilities == said[:, None]
+    stated = probabilities.max(axis=1)
+    top = probabilities == stated[:, None]
     right = top[np.arange(len(labels)), labels] / top.sum(axis=1)
-    place = np.minimum((said * bins).astype(np.int64), bins - 1)
-    gap = np.bincount(place, right - said, minlength=bins)
+    place = np.minimum((stated * bins).astype(np.int64), bins - 1)
+    gap = np.bincount(place, right - stated, minlength=bins)
     return float(np.abs(gap).sum() / len(labels))
 
 

@@ -145,11 +145,11 @@ def by_trial(
         names: of the classes.
     """
     counts, labels = check(counts, labels)
-    said = winners(counts)
+    stated = winners(counts)
     rows = []
     for number in np.unique(trial).tolist():
         there = trial == number
-        true, called = labels[there], said[there]
+        true, called = labels[there], stated[there]
         wrong = called != true
         taken = {
             f"{names[k]} as {'undecided' if j < 0 else names[j]}": int(

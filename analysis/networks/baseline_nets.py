@@ -194,14 +194,14 @@ def fitted_net(
             on_epoch(done, strict)
     assert best is not None
     net.load_state_dict(best.state)
-    said = {
+    stated = {
         "epochs": epochs,
         "chosen_epoch": best.epoch,
         "validation_strict": best.strict,
         "weights": sum(p.numel() for p in net.parameters()),
         "multiply_adds": multiply_adds(net, train.windows.shape),
     }
-    return net, said
+    return net, stated
 
 
 def _one_epoch(

@@ -131,8 +131,8 @@ def logistic_slices(
         slices: parts; a window of fewer steps has as many as steps.
     """
     train, test = (slice_sums(x, slices) for x in (train_x, test_x))
-    votes, said = _logistic_of(train, train_y, test, classes)
-    return votes, {"slices": min(slices, train_x.shape[0]), **said}
+    votes, stated = _logistic_of(train, train_y, test, classes)
+    return votes, {"slices": min(slices, train_x.shape[0]), **stated}
 
 
 def _logistic_of(
@@ -140,13 +140,13 @@ def _logistic_of(
 ) -> tuple[FloatArray, dict[str, Any]]:
     fitted = fit_logistic(np.log1p(train), check_labels(labels, classes), classes)
     features = len(fitted.mean)
-    said = {
+    stated = {
         "ridge": RIDGE,
         "weights": fitted.weights.size,
         "multiply_adds": features * classes,
         "iterations": fitted.iterations,
     }
-    return fitted.scores(np.log1p(test)), said
+    return fitted.scores(np.log1p(test)), stated
 
 
 def slice_sums(x: SparseWindows, slices: int) -> IntArray:

@@ -266,8 +266,8 @@ def _tensors(data: bytes) -> dict[str, torch.Tensor]:
         if str(name).rpartition(".")[2] not in STATES
     }
     for name, value in tensors.items():
-        kept = value.layout is torch.strided and value.device.type == "cpu"
-        if not kept or value.is_complex() or value.is_quantized:
+        retained = value.layout is torch.strided and value.device.type == "cpu"
+        if not retained or value.is_complex() or value.is_quantized:
             raise EntryError(name, value, "must be a plain tensor of real numbers")
     return {name: value.float() for name, value in tensors.items()}
 
@@ -423,18 +423,18 @@ def _filled(made: Any, weight: torch.Tensor, bias: torch.Tensor | None) -> Any:
 def _neurons(layer: Neurons, key: str, entries: _Entries, steps: int) -> nn.Module:
     """Neurons with the parameters of the description, or those of the state_dict."""
 
-    def of(parameter: str, said: float | None, called: str, *, positive: bool) -> float | None:
+    def of(parameter: str, stated: float | None, called: str, *, positive: bool) -> float | None:
         entry = f"{layer.name}.{parameter}"
-        kept = entries.perhaps(entry) if layer.name else None
-        if kept is None:
-            return said
-        if kept.numel() != 1:
-            raise EntryError(entry, kept, f"must be one number for all neurons of {key}")
-        value = float(kept)
+        retained = entries.perhaps(entry) if layer.name else None
+        if retained is None:
+            return stated
+        if retained.numel() != 1:
+            raise EntryError(entry, retained, f"must be one number for all neurons of {key}")
+        value = float(retained)
         if positive and value <= 0:
-            raise EntryError(entry, kept, f"is {value:g} and must be above zero")
-        if said is not None and np.float32(said) != np.float32(value):
-            raise KeyedError(f"{key}.{called}", said, f"the state_dict has {value:g}")
+            raise EntryError(entry, retained, f"is {value:g} and must be above zero")
+        if stated is not None and np.float32(stated) != np.float32(value):
+            raise KeyedError(f"{key}.{called}", stated, f"the state_dict has {value:g}")
         return value
 
     threshold = of("spike_threshold", layer.threshold, "threshold", positive=True)
@@ -476,8 +476,8 @@ def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.S
     if description.outputs != classes * (len(description.outputs) // len(classes)):
         raise ValueError(f"outputs must be {', '.join(classes)}, again and again")
     conv1, conv2, fc1, fc2 = weighted = [made[k] for k in (0, 2, 5, 7)]
-    said = [layer for layer in description.layers if isinstance(layer, Neurons)]
-    if any((each.spikes, each.reset) != ("single", "zero") for each in said):
+    stated = [layer for layer in description.layers if isinstance(layer, Neurons)]
+    if any((each.spikes, each.reset) != ("single", "zero") for each in stated):
         raise ValueError("neurons must fire once a step and be reset to zero")
     neurons = [made[k] for k in (1, 3, 6, 8)]
     if any(each.min_v_mem is not None for each in neurons):

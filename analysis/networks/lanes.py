@@ -80,13 +80,13 @@ def add_times(typing: Any, a: Any, at: Any, b: Any, of: Any, factor: Any) -> Any
 def _fires(context: Any, builder: Any, signature: Any, given: Any) -> Any:
     """The code of `fires` and `fires_kept`."""
     *arrays, at, threshold = given
-    current, v, *kept = (
+    current, v, *retained = (
         _place(context, builder, kind, array, at, BLOCK)
         for kind, array in zip(signature.args, arrays, strict=False)
     )
     zero = ir.Constant(_vector(BLOCK), [0.0] * BLOCK)
     u = builder.fadd(_load(builder, v, BLOCK), _load(builder, current, BLOCK))
-    for place in kept:
+    for place in retained:
         _store(builder, u, place)
     over = builder.fsub(u, _all(builder, threshold, BLOCK))
     fired = builder.fcmp_ordered(">=", over, zero)

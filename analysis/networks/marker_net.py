@@ -181,7 +181,7 @@ def _loss(probabilities: F64, labels: I64) -> float:
 
 def save(path: Path, net: MarkerNet) -> None:
     """Write a model file: whole or not at all, and the same bytes for the same model."""
-    said = {
+    stated = {
         "format": FORMAT,
         "kind": KIND,
         "classes": list(CLASSES),
@@ -196,7 +196,7 @@ def save(path: Path, net: MarkerNet) -> None:
         "weights_1": net.weights[1],
         "biases_0": net.biases[0],
         "biases_1": net.biases[1],
-        "said": np.frombuffer(json.dumps(said).encode(), np.uint8),
+        "said": np.frombuffer(json.dumps(stated).encode(), np.uint8),
     }
     write_arrays(path, arrays)
 
@@ -210,18 +210,18 @@ def load(path: Path) -> MarkerNet:
     """
     arrays = {name: np.array(array) for name, array in map_arrays(path).items()}
     try:
-        said = json.loads(arrays["said"].tobytes())
-        if said["format"] != FORMAT:
-            raise ValueError(f"format = {said['format']}: must be {FORMAT}")
-        if said["frames"] != FRAMES:
-            raise ValueError(f"frames = {said['frames']}: must be {FRAMES}")
+        stated = json.loads(arrays["said"].tobytes())
+        if stated["format"] != FORMAT:
+            raise ValueError(f"format = {stated['format']}: must be {FORMAT}")
+        if stated["frames"] != FRAMES:
+            raise ValueError(f"frames = {stated['frames']}: must be {FRAMES}")
         net = MarkerNet(
             (arrays["weights_0"], arrays["weights_1"]),
             (arrays["biases_0"], arrays["biases_1"]),
-            said["markers"],
-            said["seed"],
-            tuple(Epoch(**epoch) for epoch in said["history"]),
-            said["chosen_epoch"],
+            stated["markers"],
+            stated["seed"],
+            tuple(Epoch(**epoch) for epoch in stated["history"]),
+            stated["chosen_epoch"],
         )
         net.probabilities(np.zeros((1, FRAMES, net.markers, 2), np.float32))
     except (KeyError, TypeError, ValueError) as error:

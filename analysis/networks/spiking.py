@@ -279,7 +279,7 @@ class Trainer:
             one, two = (table.target for table in layout.tables[:2])
             above = [table.target.places for table in layout.tables[1:]]
             kernel = layout.shapes[1][2]
-            kept = (
+            retained = (
                 tuple(np.empty((self.steps, size), np.float32) for size in sizes),
                 tuple(np.empty(self.steps * size, np.uint64) for size in sizes),
                 tuple(np.empty(self.steps + 1, np.uint64) for size in sizes),
@@ -291,7 +291,7 @@ class Trainer:
                 np.zeros((two.full**2, one.depth * kernel * kernel), np.float32),
             )
             row = np.zeros(above[-1], np.float32)
-            return layout.state(), layout.scratch(), kept, planes, row
+            return layout.state(), layout.scratch(), retained, planes, row
 
     def give_back(self, memory: tuple[Any, Any, Any, Any, F32]) -> None:
         """Return borrowed memory."""

@@ -306,8 +306,8 @@ def windows_loss(
     Returns:
         the sum of the cross-entropies of the output spike counts times the gain.
     """
-    state, scratch, kept, planes = memory
-    potentials, lists, ends = kept
+    state, scratch, retained, planes = memory
+    potentials, lists, ends = retained
     classes, loss = out.shape[1], 0.0
     for i in range(rows.size):
         forward_kept(

@@ -163,7 +163,7 @@ class TrainingRun:
         self.best = 0
         self.to_grid()
         self.settle()
-        self.kept = weights(self.trained)
+        self.retained = weights(self.trained)
 
     def to_grid(self) -> None:
         """Round the fine weights to the grid, and use them for spikes."""
@@ -210,7 +210,7 @@ class TrainingRun:
         """Record an epoch; keep its weights if it is the best so far."""
         self.history.append(record)
         if self.best == 0 or record.merit > self.history[self.best - 1].merit:
-            self.best, self.kept = record.epoch, weights(self.trained)
+            self.best, self.retained = record.epoch, weights(self.trained)
 
     def state(self) -> bytes:
         """State on which the following epochs depend."""
@@ -218,7 +218,7 @@ class TrainingRun:
         content = {
             "fine": weights(self.fine),
             "optimizer": self.optimizer.state_dict(),
-            "kept": self.kept,
+            "kept": self.retained,
             "best": self.best,
             "history": [asdict(record) for record in self.history],
             "seconds": self.seconds,
@@ -236,7 +236,7 @@ class TrainingRun:
             content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
             set_weights(self.fine, content["fine"])
             self.optimizer.load_state_dict(content["optimizer"])
-            self.kept, self.best = content["kept"], content["best"]
+            self.retained, self.best = content["kept"], content["best"]
             self.history = [EpochRecord(**record) for record in content["history"]]
             self.seconds = content["seconds"]
         except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
@@ -385,7 +385,7 @@ def fit(
             if on_state is not None:
                 on_state(run.state())
     return Fitted(
-        state_dict=run.kept,
+        state_dict=run.retained,
         network=network,
         windows=windows,
         training=training,

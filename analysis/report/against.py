@@ -414,8 +414,8 @@ def render(compared: ReportComparison, here: Path, there: Path) -> str:
 
 def short_table(figures: Sequence[Change]) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows that fit a terminal."""
-    kept = [COLUMNS.index(name) for name in TERMINAL]
-    return [COLUMNS[k] for k in kept], [[row[k] for k in kept] for row in table(figures)]
+    retained = [COLUMNS.index(name) for name in TERMINAL]
+    return [COLUMNS[k] for k in retained], [[row[k] for k in retained] for row in table(figures)]
 
 
 def table(figures: Sequence[Change]) -> list[list[str]]:

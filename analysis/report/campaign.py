@@ -94,8 +94,8 @@ def collected_section(
     without = "nothing, for this rig has no frame camera"
     if all(item.recorded is not None for item in campaigns):
         without = "nothing: the recordings have no frames"
-    kept = source_words(summary) if frames else without
-    return CollectedSection(summary.quality, kept, grids, Table(columns, rows))
+    retained = source_words(summary) if frames else without
+    return CollectedSection(summary.quality, retained, grids, Table(columns, rows))
 
 
 def tracks_words(simulated: bool) -> str:

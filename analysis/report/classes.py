@@ -453,7 +453,7 @@ def _made_section(
 ) -> ClassMadeSection:
     place = store.folder.resolve()
     chosen = campaigns[0].settings
-    said = {
+    stated = {
         "windows": fitted.windows,
         "samples": chosen.samples,
         "network": fitted.network,
@@ -464,7 +464,7 @@ def _made_section(
             f"analysis.{part}.{key}",
             ", ".join(map(str, value)) if isinstance(value, list) else str(value),
         ]
-        for part, found in said.items()
+        for part, found in stated.items()
         for key, value in found.model_dump(mode="json").items()
         if key != "seeds"
     ]

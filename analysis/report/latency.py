@@ -234,8 +234,8 @@ def _draw(
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]
-        value, said = lines.get(time, (None, ""))
-        published = None if value is None else (value, said)
+        value, stated = lines.get(time, (None, ""))
+        published = None if value is None else (value, stated)
         values = {row: times(found, time) for row, found in groups.items()}
         notes = {row: _lacking(found, time) for row, found in groups.items()}
         panels.append(Panel(label, values, colour, zero, published, notes, LEAST[time]))

@@ -49,19 +49,19 @@ class EvaluatedClassifier:
 
 def read_judged(store: Store, campaigns: list[Collected]) -> EvaluatedClassifier | None:
     """Read the classifier and its evaluation; None where either is missing or stale."""
-    kept = Derived.of(store, STEP)
-    if kept.key(NAME) is None:
+    stored = Derived.of(store, STEP)
+    if stored.key(NAME) is None:
         return None
     try:
         evaluation = evaluation_of(store)
         rules = evaluation.detection.values()
-        said = next((rule for rule in rules if rule.choose == "protocol"), None)
+        stated = next((rule for rule in rules if rule.choose == "protocol"), None)
         labels = StoreLabels(store, evaluation.reviewed is not None)
         jobs = [make_marker_job(labels, campaigns)]
-        if said is not None:  # the rule was given on the command line
-            jobs.append(make_marker_job(labels, campaigns, said.margin, said.smoothing))
+        if stated is not None:  # the rule was given on the command line
+            jobs.append(make_marker_job(labels, campaigns, stated.margin, stated.smoothing))
         for job in jobs:
-            if kept.fresh(NAME, job.key):
+            if stored.fresh(NAME, job.key):
                 return EvaluatedClassifier(marker_net.load(job.model.path), evaluation)
     except StoreError:
         return None

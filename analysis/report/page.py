@@ -166,7 +166,7 @@ def write_figures(folder: Path, sections: Sequence[Content], *, simulated: bool)
     named = [figure for section in sections for figure in section.all_figures() if figure.name]
     if len({figure.name for figure in named}) < len(named):
         raise ValueError(f"two figures of one name among {[figure.name for figure in named]}")
-    kept: set[Path] = set()
+    retained: set[Path] = set()
     for figure in named:
         name = safe_name(figure.name)
         files = {
@@ -176,9 +176,9 @@ def write_figures(folder: Path, sections: Sequence[Content], *, simulated: bool)
         for path, text in files.items():
             make_folder(path.parent)
             write_text(path, text)
-            kept.add(path)
+            retained.add(path)
     for old in (*(folder / "figures").glob("*.svg"), *(folder / "data").glob("*.csv")):
-        if old not in kept:
+        if old not in retained:
             old.unlink()
 
 
@@ -190,9 +190,9 @@ def csv_text(data: Mapping[str, Sequence[object]], *, simulated: bool) -> str:
     buffer = io.StringIO()
     write = csv.writer(buffer, lineterminator="\n")
     write.writerow([*data, "simulated"])
-    said = "yes" if simulated else "no"
+    stated = "yes" if simulated else "no"
     for row in itertools.zip_longest(*data.values()):
-        write.writerow([*("" if cell is None else cell for cell in row), said])
+        write.writerow([*("" if cell is None else cell for cell in row), stated])
     return buffer.getvalue()
 
 

@@ -88,7 +88,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
         for item in campaigns
     ]
     reviewed = evaluation.reviewed is not None
-    others = other_networks.kept(store, campaigns, reviewed).values()
+    others = other_networks.retained(store, campaigns, reviewed).values()
     inputs = [
         evaluation.key,
         collected,
@@ -126,7 +126,7 @@ def read_sources(
         campaigns,
         settings=training_settings(campaigns),
         evaluation=evaluation,
-        networks=other_networks.kept(store, campaigns, labels.reviewed),
+        networks=other_networks.retained(store, campaigns, labels.reviewed),
         baselines=window_baselines.slip_methods().results(store),
         window_intervals=window_scores.window_intervals(store, evaluation.key),
         label_check=label_errors.read_check(store),

@@ -96,8 +96,8 @@ def make_summary(sources: Sources) -> Summary:
     )
     holdout = None
     if "holdout" in sources.programs:
-        kept = HOLDOUT.parse(HoldoutResult, sources.programs["holdout"])
-        holdout = holdout_part(kept)
+        retained = HOLDOUT.parse(HoldoutResult, sources.programs["holdout"])
+        holdout = holdout_part(retained)
     return Summary.model_validate(
         {
             "simulated": sources.store.simulated,

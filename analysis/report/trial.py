@@ -111,9 +111,9 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
     item, recording = example.item, example.recording
     frame_ns, displacement_px = np.empty(0, np.int64), np.empty((0, 0))
     if "displacement_px" in (
-        kept := Derived.of(store, LABELS, item.name).arrays(recording.trial_id)
+        stored := Derived.of(store, LABELS, item.name).arrays(recording.trial_id)
     ):
-        frame_ns, displacement_px = kept["frame_ns"], kept["displacement_px"]
+        frame_ns, displacement_px = stored["frame_ns"], stored["displacement_px"]
     start, end = dataset.recorded_span(recording)
     event_s, cell = _events(item, recording, start)
     onsets = example.onsets_s()

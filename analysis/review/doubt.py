@@ -260,8 +260,8 @@ def _crossed(store: Store, case: ReviewedTrial) -> dict[Kind, tuple[int, int] | 
     label, settings = case.label, case.item.settings.labelling
     if label.rule != "paper" or label.paper is None or label.doubts.incipient:
         return {}
-    kept = Derived.of(store, LABELS, case.item.name)
-    arrays = kept.arrays(case.trial.id, "frame_ns", "displacement_px", "sigma_px")
+    stored = Derived.of(store, LABELS, case.item.name)
+    arrays = stored.arrays(case.trial.id, "frame_ns", "displacement_px", "sigma_px")
     frame_ns, start_ns = arrays["frame_ns"], case.recording.motion_ns[0]
     if label.reference == "hold_start":
         start_ns = int(frame_ns[0])

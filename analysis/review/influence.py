@@ -237,15 +237,15 @@ def accuracy_figure(
     Args:
         samples: the test windows. counts: the network's (n, 3) of them. length_ns: of a window.
     """
-    said = winners(counts)
-    hits, total = (said == samples.y).astype(np.float64), len(samples.trials)
+    stated = winners(counts)
+    hits, total = (stated == samples.y).astype(np.float64), len(samples.trials)
     places: dict[Name, int] = {name: place for place, name in enumerate(samples.trials)}
     reviews = {}
     for name, draw in drawn.items():
         if name in places:
             ours = samples.trial == places[name]
             classes = drawn_classes(samples.start_ns[ours] + length_ns // 2, draw)
-            right = (said[ours, None] == classes).sum(axis=0)
+            right = (stated[ours, None] == classes).sum(axis=0)
             reviews[places[name]] = (
                 np.where(draw.usable, right, 0).astype(np.float64),
                 np.where(draw.usable, ours.sum(), 0).astype(np.float64),

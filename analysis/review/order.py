@@ -233,10 +233,10 @@ def _windows(
     length_ns = item.settings.windows.length_ms * 1_000_000
     parts = [part for split in ("train", "validation") if (part := _samples(store, split))]
     shares = trained_shares(parts, length_ns, item.settings.samples.per_class, drawn)
-    kept, test = kept_counts(store, evaluation.key), _samples(store, "test")
-    if kept is None or test is None or not np.array_equal(kept["y"], test.y):
+    retained, test = kept_counts(store, evaluation.key), _samples(store, "test")
+    if retained is None or test is None or not np.array_equal(retained["y"], test.y):
         return [], shares
-    return [accuracy_figure(evaluation, test, kept["counts"], length_ns, drawn)], shares
+    return [accuracy_figure(evaluation, test, retained["counts"], length_ns, drawn)], shares
 
 
 def _samples(store: Store, split: str) -> SampleSet | None:

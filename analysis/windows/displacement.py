@@ -75,28 +75,28 @@ def marker_displacements(
     Raises:
         FileNotFoundError: the trial was never labelled.
     """
-    kept = Derived.of(labels.store, LABELS, item.name).arrays(recording.folder.name)
-    if "xy_px" not in kept:
+    stored = Derived.of(labels.store, LABELS, item.name).arrays(recording.folder.name)
+    if "xy_px" not in stored:
         raise StoreError(
             f"{item.name}: {recording.trial_id}: its label came with the recording, so no markers "
             "were tracked, which the classifier on frames needs"
         )
     plate, plane = None, None
-    if "plate_px" in kept:
-        corners, seen = kept["plate_corners_px"].astype(np.float64), kept["plate_seen"]
-        sigma = np.where(np.isfinite(kept["plate_px"]).all(axis=1), TRACKS_PLATE_PX, np.nan)
-        plate = PlateTrack(kept["plate_px"].astype(np.float64), corners, seen, sigma)
+    if "plate_px" in stored:
+        corners, seen = stored["plate_corners_px"].astype(np.float64), stored["plate_seen"]
+        sigma = np.where(np.isfinite(stored["plate_px"]).all(axis=1), TRACKS_PLATE_PX, np.nan)
+        plate = PlateTrack(stored["plate_px"].astype(np.float64), corners, seen, sigma)
         if recording.has_video:
             width, height = recording.frame_px[:2]
             plane = plane_of(corners, seen, (width, height))
     places = Places(
-        kept["xy_px"].astype(np.float64),
-        kept["sigma_px"].astype(np.float64),
-        kept["quality"] / 100,
+        stored["xy_px"].astype(np.float64),
+        stored["sigma_px"].astype(np.float64),
+        stored["quality"] / 100,
         plate,
         plane,
     )
-    frame_ns: I64 = kept["frame_ns"]
+    frame_ns: I64 = stored["frame_ns"]
     found = offsets(places, frame_ns, recording.motion_ns[0], item.settings.labelling.reference_ms)
     return frame_ns, _held(found.counted_from("hold_start"))
 

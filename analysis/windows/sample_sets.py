@@ -103,14 +103,14 @@ def _load(
     settings = [item.settings.samples.model_dump(mode="json") for item in used]
     parameters: list[Any] = [windows.model_dump(mode="json"), settings]
     key = make_key(STEP, dataset.VERSION, inputs, [*parameters, classes] if classes else parameters)
-    kept = Derived.of(labels.store, STEP)
+    stored = Derived.of(labels.store, STEP)
     name = f"{CLASS_PREFIX}{split}" if classes else split
-    path = kept.folder / f"{name}.arrays"
-    if not (kept.fresh(name, key) and path.exists()):
+    path = stored.folder / f"{name}.arrays"
+    if not (stored.fresh(name, key) and path.exists()):
         made = _make(labels, trials, windows, each, classes)
-        kept.folder.mkdir(parents=True, exist_ok=True)
+        stored.folder.mkdir(parents=True, exist_ok=True)
         made.save(path)
-        kept.write(name, key, {"samples": len(made), "cells": len(made.windows.cell)})
+        stored.write(name, key, {"samples": len(made), "cells": len(made.windows.cell)})
     return SampleSet.load(path)
 
 

@@ -81,13 +81,13 @@ class SparseWindows:
             raise ValueError(f"{steps} of {self.shape[0]} steps")
         return self._taken(np.arange(len(self)), steps)
 
-    def _taken(self, rows: I64, kept: int) -> SparseWindows:
+    def _taken(self, rows: I64, retained: int) -> SparseWindows:
         steps = self.shape[0]
-        sizes = np.diff(self.offsets).reshape(-1, steps)[rows, :kept].ravel()
+        sizes = np.diff(self.offsets).reshape(-1, steps)[rows, :retained].ravel()
         offsets = np.concatenate([[0], sizes.cumsum()]).astype(np.int64)
-        begin = self.offsets[:-1].reshape(-1, steps)[rows, :kept].ravel()
+        begin = self.offsets[:-1].reshape(-1, steps)[rows, :retained].ravel()
         entries = np.arange(offsets[-1]) + np.repeat(begin - offsets[:-1], sizes)
-        shape = (kept, *self.shape[1:])
+        shape = (retained, *self.shape[1:])
         return SparseWindows(shape, offsets, self.cell[entries], self.count[entries])
 
     def mirrored(self, how: npt.NDArray[np.integer[Any]]) -> SparseWindows:

@@ -62,11 +62,11 @@ def measure_guesses(
     measured = sweep.run(
         begin=lambda number, count, task: console.say(f"[{number}/{count}] {task.name} (simulated)")
     )
-    kept = work.results.load().settings
+    saved = work.results.load().settings
     return SettingsMeasured(
         {name: len(ids) for name, ids in work.trials.items()},
         measured,
-        {task.name: figures(kept[task.name]) for task in sweep.points},
+        {task.name: figures(saved[task.name]) for task in sweep.points},
         str(work.results.path),
     )
 

@@ -160,8 +160,10 @@ def tradeoff_rows(result: Result) -> list[list[str]]:
 
 def short_table(result: Result) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows of the variants that fit a terminal."""
-    kept = [COLUMNS.index(name) for name in TERMINAL]
-    return [COLUMNS[k] for k in kept], [[row[k] for k in kept] for row in tradeoff_rows(result)]
+    retained = [COLUMNS.index(name) for name in TERMINAL]
+    return [COLUMNS[k] for k in retained], [
+        [row[k] for k in retained] for row in tradeoff_rows(result)
+    ]
 
 
 def choice_pairs(result: Result) -> dict[str, str]:

@@ -78,13 +78,13 @@ def look(seen: SceneRun, windows: Windows, samples: SampleSettings, seed: int) -
 def _selected(seen: SceneRun, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Mask of events that have the selected polarity and lie in the centred crop, (n,)."""
     assert seen.events is not None
-    kept = np.ones(len(seen.events), np.bool_)
+    retained = np.ones(len(seen.events), np.bool_)
     for place, size in zip((seen.events.x, seen.events.y), seen.size_px, strict=True):
         first = (size - windows.crop_px) // 2
-        kept &= (place >= first) & (place < first + windows.crop_px)
+        retained &= (place >= first) & (place < first + windows.crop_px)
     if windows.polarity != "both":
-        kept &= (seen.events.p > 0) == (windows.polarity == "positive")
-    return kept
+        retained &= (seen.events.p > 0) == (windows.polarity == "positive")
+    return retained
 
 
 def pooled(trials: Sequence[SceneWindows]) -> dict[str, Any]:

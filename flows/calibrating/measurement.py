@@ -150,7 +150,7 @@ class Measurement:
             remove=finding.remove,
             expected=self.text,
         )
-        self._report(finding, written.path, written.kept)
+        self._report(finding, written.path, written.retained)
 
     def _rows(self, moves: Sequence[PlannedMove]) -> list[AnnouncedMove]:
         plane = self.file.calibration.contact_plane
@@ -202,7 +202,7 @@ class Measurement:
         console.print_table(title, columns, table)
         console.say(who or ANNOUNCEMENT)
 
-    def _report(self, finding: MeasurementResult, path: Path, kept: Path | None) -> None:
+    def _report(self, finding: MeasurementResult, path: Path, stored: Path | None) -> None:
         removed = [key for key in finding.remove if self._had(key)]
         if self.as_json:
             console.print_json(
@@ -212,7 +212,7 @@ class Measurement:
                     "simulated": self.file.simulated,
                     **finding.figures,
                     "written": str(path),
-                    "kept": kept and str(kept),
+                    "kept": stored and str(stored),
                     "keys": list(finding.changes),
                     "removed": removed,
                 }
@@ -224,8 +224,8 @@ class Measurement:
         console.say(f"written to {path}: {', '.join(finding.changes)}")
         for key in removed:
             console.say(f"removed {key}: it belonged to the previous calibration")
-        if kept is not None:
-            console.say(f"the old file is kept as {kept}")
+        if stored is not None:
+            console.say(f"the old file is kept as {stored}")
 
     def _had(self, key: str) -> bool:
         return getattr(self.file.calibration, key.rpartition(".")[2], None) is not None

@@ -86,8 +86,8 @@ def check(
     if as_json:
         console.print_json(preflight.checks_json(found))
     else:
-        said = ["FAILED" if not it.passed else "note" if it.caution else "ok" for it in found]
-        rows = [[word, it.name, it.finding] for word, it in zip(said, found, strict=True)]
+        stated = ["FAILED" if not it.passed else "note" if it.caution else "ok" for it in found]
+        rows = [[word, it.name, it.finding] for word, it in zip(stated, found, strict=True)]
         console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
     if not all(item.passed for item in found):
         raise typer.Exit(console.FAILED)

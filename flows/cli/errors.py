@@ -136,8 +136,8 @@ def failure(error: Exception) -> Failure:
         return Failure(known, console.FAILED)
     if isinstance(error, InputError):
         return _wrong_input(error)
-    if said := extras.lacking(error, _command()):
-        return Failure(said, console.WRONG_INPUT)
+    if stated := extras.lacking(error, _command()):
+        return Failure(stated, console.WRONG_INPUT)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
     if isinstance(error, FileNotFoundError | NotADirectoryError) and error.filename:

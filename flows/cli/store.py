@@ -187,8 +187,8 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     """
     from sliplab.storage.errors import translated_disk_errors
     from sliplab.storage.trials.lock import exclusive
-    from sliplab.storage.trials.migrate import kept
     from sliplab.storage.trials.migrate import migrate as migrate_store
+    from sliplab.storage.trials.migrate import retained
     from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
@@ -197,7 +197,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
         exclusive(opened.folder / ".lock", f"the store {opened.folder}"),
     ):
         passed = migrate_store(opened)
-    copies = [str(kept(opened, number)) for number in passed]
+    copies = [str(retained(opened, number)) for number in passed]
     if as_json:
         console.print_json({"format": opened.format, "from": passed, "copies": copies})
     elif passed:

@@ -454,9 +454,9 @@ class TrialCollector:
             quality=TrialQuality(passed=found.passed, gates=found.gates),
             steps=tuple(
                 MotionStep(
-                    phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=kept
+                    phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=retained
                 )
-                for step, kept in run.steps
+                for step, retained in run.steps
             ),
             geometry=self._geometry(frame_px),
         )

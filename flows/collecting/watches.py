@@ -52,12 +52,12 @@ class DiskWatch:
     def needs(self, trial: Trial) -> float:
         """Return the bytes that a trial takes while it is written."""
         rig, plan = self._run_request.rig, self._run_request.plan
-        kept = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
+        retained = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
         frame = rig.frame_px(plan)
         if not rig.frame_camera.spool or frame is None:
-            return kept
+            return retained
         rate = rig.frame_rate_hz(plan)
-        return kept + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
+        return retained + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
 
     def check(self, trial: Trial) -> None:
         """Check that the next trial fits.

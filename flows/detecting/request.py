@@ -248,8 +248,8 @@ def _grip(text: str, file: RigFile, deeper_mm: float, deepest: float, hold_s: fl
     if deeper_mm < allowed.step_mm:
         right = f"is less than the gripper's step: at least grip:{allowed.step_mm:.2g}"
         raise InputError("--reflex", "", text, right)
-    said = None if file.reflex is None else file.reflex.force
-    force_n = allowed.force_n[0] if said is None else float(said)
+    stated = None if file.reflex is None else file.reflex.force
+    force_n = allowed.force_n[0] if stated is None else float(stated)
     most = file.limits.force
     if most is not None and force_n > most:
         right = (
@@ -266,7 +266,7 @@ def _shallowest_mm(program: Program) -> float:
     return min(step.to.depth_mm for step in moves)
 
 
-def _detection(said: AnalysisSettings, fitted: Fitted, change: Mapping[str, float]) -> Detection:
+def _detection(stated: AnalysisSettings, fitted: Fitted, change: Mapping[str, float]) -> Detection:
     network = fitted.network
-    rule = said.rule_for(network.outputs_per_class, network.margin)
+    rule = stated.rule_for(network.outputs_per_class, network.margin)
     return Detection.model_validate({**rule.model_dump(), **change})

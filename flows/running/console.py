@@ -237,7 +237,7 @@ class ProgressBar:
 
     def __init__(self, progress: Progress, task: Any) -> None:
         self._progress, self._task = progress, task
-        self._said_s = time.monotonic()
+        self._printed_s = time.monotonic()
 
     def advance(self, count: float = 1, note: str = "", left: str = "") -> None:
         """Advance by `count`; a stop request raises here.
@@ -251,8 +251,8 @@ class ProgressBar:
         stopping.check()
         self._progress.update(self._task, advance=count, note=printable(note), left=left)
         now_s = time.monotonic()
-        if not messages.is_terminal and now_s - self._said_s >= LINE_EVERY_S:
-            self._said_s = now_s
+        if not messages.is_terminal and now_s - self._printed_s >= LINE_EVERY_S:
+            self._printed_s = now_s
             self._say(note, left)
 
     def _say(self, note: str, left: str) -> None:

@@ -78,7 +78,7 @@ class EmbeddedServer:
         self.password = password or new_password()
         self._log = home / "server.log"
         kind = {"PREFECT_UI_ENABLED": "1"} if page else {**LEAN, **_HEADLESS}
-        kept = {name: value for name, value in os.environ.items() if name not in _HEADLESS}
+        retained = {name: value for name, value in os.environ.items() if name not in _HEADLESS}
         try:
             written = self._log.open("w")
         except OSError as error:
@@ -103,7 +103,7 @@ class EmbeddedServer:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=[handle],
-                env={**kind, **kept, **_closed(self.port, self.password)},
+                env={**kind, **retained, **_closed(self.port, self.password)},
             )
             os.close(handle)
         self._answers = False

@@ -50,6 +50,6 @@ def named(who: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if said := lacking(error, who):
-            raise ModuleNotFoundError(said, name=error.name) from error
+        if stated := lacking(error, who):
+            raise ModuleNotFoundError(stated, name=error.name) from error
         raise

@@ -168,8 +168,8 @@ def _is_fault(record: logging.LogRecord) -> bool:
 
 def _ask_loopback_directly() -> None:
     """Exclude the loopback from the proxies that the environment names: they cannot reach it."""
-    kept = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
-    names = [name.strip() for name in kept.split(",") if name.strip()]
+    retained = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
+    names = [name.strip() for name in retained.split(",") if name.strip()]
     names += [name for name in _LOOPBACK if name not in names]
     os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(names)
 
@@ -366,8 +366,8 @@ class _Work:
         """State and message of its end, as Prefect calls it."""
         if self.error is None:
             return "COMPLETED", ""
-        said = f"{type(self.error).__name__}: {self.error}"
-        return ("FAILED" if isinstance(self.error, Exception) else "CRASHED"), said
+        stated = f"{type(self.error).__name__}: {self.error}"
+        return ("FAILED" if isinstance(self.error, Exception) else "CRASHED"), stated
 
 
 class WorkNotBegun(RuntimeError):

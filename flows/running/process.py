@@ -39,7 +39,7 @@ class _ByteStream(io.RawIOBase):
 
     def __init__(self, handle: int, lost: str = "", *, required: bool) -> None:
         self._handle, self._lost, self._required = handle, lost, required
-        self._stalled = self._told = False
+        self._stalled = self._reported = False
         self._poll = select.poll()
         self._poll.register(handle, select.POLLOUT)
 
@@ -67,8 +67,8 @@ class _ByteStream(io.RawIOBase):
                 return 0
             except OSError as error:
                 self._lost = error.strerror or type(error).__name__
-        if self._lost and self._required and not self._told:
-            self._told = True
+        if self._lost and self._required and not self._reported:
+            self._reported = True
             raise OutputLost(f"the result cannot be written to standard output: {self._lost}")
         return len(data)
 

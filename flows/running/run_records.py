@@ -77,14 +77,14 @@ def end(store: Path, run: str, state: str, message: str, by: str) -> bool:
     folder = _folder(store)
     if not (folder / f"{run}.json").exists():
         return False
-    said = {"state": state, "message": message, "when": now(), "by": by}
-    return write_new_json(folder / f"{run}.end.json", said)
+    stated = {"state": state, "message": message, "when": now(), "by": by}
+    return write_new_json(folder / f"{run}.end.json", stated)
 
 
 def record_undelivered_end(store: Path, run: str, state: str, message: str) -> None:
     """Keep an end that the server did not take; `close_killed_runs` reports it."""
-    said = {"state": state, "message": message, "when": now()}
-    write_new_json(_folder(store) / f"{run}.owed.json", said)
+    stated = {"state": state, "message": message, "when": now()}
+    write_new_json(_folder(store) / f"{run}.owed.json", stated)
 
 
 def end_of(store: Path, run: str) -> Json | None:
@@ -143,8 +143,8 @@ def close_killed_runs(store: Path, server: str, client: Any = None) -> list[Json
 
     with nullcontext(client) if client else get_client(sync_client=True) as client:
         for path, run in owed:
-            said = read_json(path)
-            _report(client, run, said["state"], said["message"])
+            stated = read_json(path)
+            _report(client, run, stated["state"], stated["message"])
             path.unlink(missing_ok=True)
         for item in dead:
             message = (

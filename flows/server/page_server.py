@@ -169,8 +169,8 @@ def page_password(home: Path) -> str:
     """
     path = home / PASSWORD
     with suppress(OSError, UnicodeDecodeError):
-        if _private(path) and re.fullmatch(_PASSWORD, kept := path.read_text().strip()):
-            return kept
+        if _private(path) and re.fullmatch(_PASSWORD, saved := path.read_text().strip()):
+            return saved
     password = new_password()
     try:
         write_bytes(path, f"{password}\n".encode(), mode=0o600)

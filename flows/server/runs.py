@@ -132,8 +132,8 @@ class ServedRuns:
 
         assert self._process is not None
         run = str(self._run.id)
-        if (kept := run_records.end_of(self._store, run)) is not None:
-            state: Any = State(type=StateType(kept["state"]), message=kept["message"])
+        if (retained := run_records.end_of(self._store, run)) is not None:
+            state: Any = State(type=StateType(retained["state"]), message=retained["message"])
         elif cancelled:
             state = Cancelled(message="stopped before it started")
         else:
@@ -182,9 +182,9 @@ def _carry_out(run_id: str, flow_name: str) -> None:
             pass  # the server requested it
         except Exception as error:
             link.mark_lost(error)
-            if (kept := run_records.end_of(here.folder, run_id)) is not None:
+            if (retained := run_records.end_of(here.folder, run_id)) is not None:
                 run_records.record_undelivered_end(
-                    here.folder, run_id, kept["state"], kept["message"]
+                    here.folder, run_id, retained["state"], retained["message"]
                 )
     if not orchestration.close():
         os._exit(0)

@@ -177,13 +177,13 @@ class ReviewTab:
             self._drop(found)
             return
         again = self.shown is not None and self.shown.row.name == found.row.name
-        kept = self.plots.onsets() if again and self._is_moved() else None
+        retained = self.plots.onsets() if again and self._is_moved() else None
         self._drop(self.shown)
         self.shown = found
         decided = self._history()
         self.frame.frame_to(found)
         self._close_by = False
-        self.plots.show(found, kept or self._lines_of(found, decided))
+        self.plots.show(found, retained or self._lines_of(found, decided))
         if not again:
             self.see.reason.value = ""
         self._head()
@@ -314,7 +314,7 @@ class ReviewTab:
             self._cursor(float(self.shown.frame_s[min(max(self._frame + by, 0), last)]))
 
     def _say(self, text: str, *, good: bool = False) -> None:
-        self.see.said.text = f"<p class='{'good' if good else 'bad'}'>{escape(text)}</p>"
+        self.see.stated.text = f"<p class='{'good' if good else 'bad'}'>{escape(text)}</p>"
 
     def close(self) -> None:
         """Close what the tab has open; the tab is gone."""

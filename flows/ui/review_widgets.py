@@ -123,7 +123,7 @@ class Widgets:
         # a table redraws itself only if its number of rows changed
         self.source.js_on_change("data", CustomJS(args={"table": self.table}, code=_REDRAW))
         self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
-        self.said, self.caption = _div(), _div()
+        self.stated, self.caption = _div(), _div()
         self.who = TextInput(title="reviewer", value=who, width=120)
         self.reason = TextInput(title="reason (required to reject)", value="", width=300)
         self.go_on = Checkbox(label="then the next", active=True)
@@ -164,7 +164,7 @@ class Widgets:
             tools,
             decide,
             buttons,
-            self.said,
+            self.stated,
             self.past,
             sizing_mode="stretch_width",
         )

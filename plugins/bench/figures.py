@@ -126,9 +126,9 @@ def accuracy(scenes: Sequence[SceneEvidence], length_us: int = 30_000) -> float 
         found, slip = scene.evidence, scene.slip
         middle = found.t_us - length_us // 2
         true = (middle >= slip.paper_us).astype(np.int64) + (middle >= slip.gross_us)
-        said = found.label != NO_LABEL
-        every += np.bincount(true[said], minlength=len(CLASSES))
-        right += np.bincount(true[said & (found.label == true)], minlength=len(CLASSES))
+        stated = found.label != NO_LABEL
+        every += np.bincount(true[stated], minlength=len(CLASSES))
+        right += np.bincount(true[stated & (found.label == true)], minlength=len(CLASSES))
     return float((right / every).mean()) if every.all() else None
 
 

@@ -282,7 +282,7 @@ def run_bench(
         raise InputError("DETECTOR", "", twice, "must be named once")
     for name in names:
         make_detector(name).close()  # wrong input fails before anything is simulated
-    kept = Derived(folder / "detectors")
+    saved = Derived(folder / "detectors")
     keys = {
         name: make_key("bench", VERSION, [name, contents(name)], [ENTRIES_VERSION, size, seed])
         for name in names
@@ -290,12 +290,12 @@ def run_bench(
 
     def keep(found: KeptDetector) -> None:
         key = keys[found.row.name]
-        kept.write(key[:16], key, found)
+        saved.write(key[:16], key, found)
 
-    missing = [name for name, key in keys.items() if not kept.fresh(key[:16], key)]
+    missing = [name for name, key in keys.items() if not saved.fresh(key[:16], key)]
     if missing:
         _judge_each([DetectorJob(name, SIZES[size], seed) for name in missing], workers, keep)
-    found = [kept.load(key[:16], KeptDetector) for key in keys.values()]
+    found = [saved.load(key[:16], KeptDetector) for key in keys.values()]
     return BenchResult(
         simulated=True,
         version=VERSION,

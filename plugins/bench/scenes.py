@@ -167,14 +167,14 @@ def simulated(drawn: SceneDraw) -> Scene:
     t_us = events.t_us - begin_ns // 1000
     inside = slice(*np.searchsorted(t_us, (0, end_us)))
     # copies: views would keep what follows in memory
-    kept = EventChunk(
+    retained = EventChunk(
         events.x[inside].copy(),
         events.y[inside].copy(),
         events.p[inside].copy(),
         t_us[inside].copy(),
     )
     size = built.events.width, built.events.height
-    return Scene(drawn.name, kept, *size, int(end_us), slip, drawn.world)
+    return Scene(drawn.name, retained, *size, int(end_us), slip, drawn.world)
 
 
 def _plan(drawn: SceneDraw) -> Plan:

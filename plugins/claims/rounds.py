@@ -295,10 +295,10 @@ class ClaimWatch:
         simulated = "simulated " if self._run_request.rig.simulated else ""
         console.say(f"after {look.taken} {simulated}trials, of {TARGET}:")
         for state in look.claims:
-            console.say(f"  {said(state)}")
+            console.say(f"  {stated(state)}")
 
 
-def said(state: ClaimState) -> str:
+def stated(state: ClaimState) -> str:
     """Return a claim's state as a line of text."""
     ends = ["-" if end is None else f"{end:.4g}" for end in (state.low, state.high)]
     value = "-" if state.estimate is None else f"{state.estimate:.4g}"

@@ -100,15 +100,15 @@ def _warnings(fitted: Fitted, data: CardData, splits: Mapping[str, SplitResult])
 def card_markdown(card: ModelCard) -> str:
     """Return the card as Markdown."""
     model, data = card.model, card.data
-    said = " (simulated)" if card.simulated else ""
-    text = [f"# {model.file}{said}", ""]
+    stated = " (simulated)" if card.simulated else ""
+    text = [f"# {model.file}{stated}", ""]
     text.append(
         f"Spiking network, {model.parameters:,} weights, seed {model.seed}, epoch "
         f"{model.chosen_epoch} of {model.epochs}. SHA-256 `{model.sha256}`."
     )
     if card.warnings:
         text += ["", "## Warnings", "", *(f"- {warning}" for warning in card.warnings)]
-    text += ["", f"## Data{said}", ""]
+    text += ["", f"## Data{stated}", ""]
     text += table(
         ["campaign", "experiment", "collection", "analysis", "rig", "train", "validation", "test"],
         [
@@ -123,7 +123,7 @@ def card_markdown(card: ModelCard) -> str:
             for item in data.campaigns
         ],
     )
-    text += ["", f"## Accuracy over windows{said}", ""]
+    text += ["", f"## Accuracy over windows{stated}", ""]
     names = [name.replace("_", " ") for name in CLASSES]
     text += table(
         ["split", "trials", "windows", "strict", f"margin {card.margin:g}", "argmax"]
@@ -142,10 +142,10 @@ def card_markdown(card: ModelCard) -> str:
         ],
     )
     text += ["", "Strict: only a unique winner counts. Argmax shares ties."]
-    text += ["", f"## Detection over whole test trials{said}", ""]
+    text += ["", f"## Detection over whole test trials{stated}", ""]
     text += latency_table(card.detection)
     spikes = card.activity
-    text += ["", f"## Spikes and operations a window{said}", ""]
+    text += ["", f"## Spikes and operations a window{stated}", ""]
     text += table(
         ["layer", "spikes per neuron and step", "synaptic operations", "multiply-adds if dense"],
         [

@@ -265,7 +265,7 @@ NOT_SHOWN = (
 def speck_markdown(found: SpeckDescription) -> str:
     """Write the content of ``*.speck.json`` as a page."""
     fit, whole = found.fit, found.quantisation
-    said = " (simulated)" if found.simulated else ""
+    stated = " (simulated)" if found.simulated else ""
     text = [f"# {found.model.file} on a Speck", ""]
     if fit.fits:
         text.append("It fits: one core a layer.")
@@ -321,13 +321,13 @@ def speck_markdown(found: SpeckDescription) -> str:
     text += [
         "",
         f"A potential holds 16 bits and is cut off beyond. Over {change.windows} windows"
-        f"{said}: equal spike counts in {percent(change.equal_counts)}, the same class in "
+        f"{stated}: equal spike counts in {percent(change.equal_counts)}, the same class in "
         f"{percent(change.equal_class)}, the same class by the margin in "
         f"{percent(change.equal_class_by_margin)}; a count changes by "
         f"{change.mean_change:.2f} on average and {change.largest_change} at most.",
         "",
         *table(
-            [f"accuracy{said}", "as trained", "8 bits"],
+            [f"accuracy{stated}", "as trained", "8 bits"],
             [
                 ["strict", percent(real.strict), percent(chip.strict)],
                 ["margin", percent(real.margin), percent(chip.margin)],
@@ -335,11 +335,11 @@ def speck_markdown(found: SpeckDescription) -> str:
             ],
         ),
         "",
-        f"## Detection latency as trained{said}",
+        f"## Detection latency as trained{stated}",
         "",
         *latency_table(found.detection["real"]),
         "",
-        f"## Detection latency with 8 bits{said}",
+        f"## Detection latency with 8 bits{stated}",
         "",
         *latency_table(found.detection["whole"]),
         "",

@@ -221,8 +221,8 @@ def _protective(bench: ArmBench) -> None:
     if state.healthy or state is ArmState.EMERGENCY_STOP:
         raise RuleViolation(f"in a protective stop its state was {state}")
     with suppress(RigError):
-        if (said := bench.call("progress", bench.arm.progress).state).healthy:
-            raise RuleViolation(f"in a protective stop the state of its progress was {said}")
+        if (stated := bench.call("progress", bench.arm.progress).state).healthy:
+            raise RuleViolation(f"in a protective stop the state of its progress was {stated}")
     for _ in range(2):
         bench.stop()
     bench.until(lambda: not bench.moving(), bench.bounds.call_s)

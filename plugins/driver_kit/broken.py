@@ -150,9 +150,9 @@ class OldData(FakedExampleFrames):
     def start(self) -> None:
         """Start grabbing."""
         with suppress(RigError):
-            kept = self._buffer.take("frames")
+            retained = self._buffer.take("frames")
         super().start()
-        self._buffer._parts["frames"] = kept
+        self._buffer._parts["frames"] = retained
 
 
 class LeftOpen(ExampleForce):

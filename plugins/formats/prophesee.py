@@ -158,23 +158,23 @@ def read_header(path: Path) -> Header:
     head = read_head(path)
     size = path.stat().st_size
     lines, begin = _lines(path, size)
-    said = {key: value for words in lines for key, value in _values(words)}
-    t0_us = int(said.get("t0", "0"))
+    given = {key: value for words in lines for key, value in _values(words)}
+    t0_us = int(given.get("t0", "0"))
     if t0_us >= LAST_TURN_US:
         raise FormatError(f"counts times from {t0_us} us, which is no time")
-    if "evt" in said:
-        encoding = _ENCODINGS.get(said["evt"])
+    if "evt" in given:
+        encoding = _ENCODINGS.get(given["evt"])
         if encoding is None:
-            raise FormatError(f"is of EVT {said['evt']}; read are EVT 2.0, 2.1 and 3.0")
-        if said.get("endianness") == "big":
+            raise FormatError(f"is of EVT {given['evt']}; read are EVT 2.0, 2.1 and 3.0")
+        if given.get("endianness") == "big":
             raise FormatError("is big-endian; read are little-endian files")
         end = size - (size - begin) % np.dtype(encoding.dtype).itemsize
-        swapped = encoding is EVT21 and said.get("endianness") == "legacy"
-        return Header(encoding, begin, end, _size(said), t0_us, swapped=swapped)
-    if "version" in said:
-        bits = _dat_bits(path, begin, said["version"])
+        swapped = encoding is EVT21 and given.get("endianness") == "legacy"
+        return Header(encoding, begin, end, _size(given), t0_us, swapped=swapped)
+    if "version" in given:
+        bits = _dat_bits(path, begin, given["version"])
         begin += 2
-        return Header(DAT, begin, size - (size - begin) % _DAT_BYTES, _size(said), t0_us, bits)
+        return Header(DAT, begin, size - (size - begin) % _DAT_BYTES, _size(given), t0_us, bits)
     if not head or _HEADER.fullmatch(head):
         raise Damage(_HEADER_CUT)
     raise FormatError(
@@ -247,8 +247,8 @@ def _values(words: list[str]) -> Iterator[tuple[str, str]]:
                 yield name, content
 
 
-def _size(said: dict[str, str]) -> tuple[int, int] | None:
-    width, height = int(said.get("width", "0")), int(said.get("height", "0"))
+def _size(given: dict[str, str]) -> tuple[int, int] | None:
+    width, height = int(given.get("width", "0")), int(given.get("height", "0"))
     return (width, height) if 0 < width < _MOST_SIDE and 0 < height < _MOST_SIDE else None
 
 

@@ -141,8 +141,8 @@ def _copy_trial(
         shutil.copyfile(path, target / name)
     shutil.copyfile(recording.folder / CHECKSUMS, target / CHECKSUMS)
     made = campaign.provenance(recording).to_json()
-    kept = {key: value for key, value in made.items() if key not in PERSONAL}
-    write_json_aside(target / PROVENANCE, kept)
+    retained = {key: value for key, value in made.items() if key not in PERSONAL}
+    write_json_aside(target / PROVENANCE, retained)
     labels = Derived.of(store, LABELS, campaign.name)
     results = {LABELS: [labels.folder / f"{trial}.json", labels.arrays_path(trial)]}
     if recording.refitted:

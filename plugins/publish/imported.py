@@ -135,7 +135,7 @@ def _trial(
     if folder.is_symlink() or not folder.is_dir():
         raise DamagedFile(folder, "", None, "is not a trial folder")
     labels = Derived.of(store, LABELS, where.name)
-    kept = {
+    retained = {
         LABELS: [labels.folder / f"{folder.name}.json", labels.arrays_path(folder.name)],
         SYNC: [where.sync_file(folder.name)],
     }
@@ -150,7 +150,7 @@ def _trial(
         original=PublishedTrial(
             folder,
             record.counts,
-            {step: [f for f in files if f.exists()] for step, files in kept.items()},
+            {step: [f for f in files if f.exists()] for step, files in retained.items()},
         ),
     )
 

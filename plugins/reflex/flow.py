@@ -165,17 +165,17 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
         "virtual_time": asked.rig.in_virtual_time,
         "detectors": {name: it.model_sha256 for name, it in asked.requests.items()},
     }
-    kept = ResultFile(asked.out / f"{NAME}.json", ReflexStudy, "trials", head)
+    saved = ResultFile(asked.out / f"{NAME}.json", ReflexStudy, "trials", head)
     with ExitStack() as done:
         build = done.enter_context(_builder(asked.rig))
         networks = {name: counting_of(it.fitted) for name, it in asked.requests.items()}
         sweep = Sweep(
-            asked.cases, kept, lambda case, _: (measure(asked, case, networks, build), None)
+            asked.cases, saved, lambda case, _: (measure(asked, case, networks, build), None)
         )
         simulated = "simulated trials" if asked.rig.in_virtual_time else "trials in real time"
         bar = done.enter_context(console.bar(f"reflexes ({simulated})", len(sweep.pending)))
         sweep.run(bar.advance)
-    known = kept.load().trials
+    known = saved.load().trials
     trials = {case.name: known[case.name] for case in asked.cases}
     rows = reflex_rows(trials.values())
     return ReflexStudy.model_validate({**head, "rows": rows, "trials": trials})

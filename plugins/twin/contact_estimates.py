@@ -121,11 +121,11 @@ def lags_of(slips: SlideSlips, ring: I64, table: SteadyLags, growth: Growth) -> 
         normal[level], stiffness[level] = mean_seen(held[these]), mean_seen(slope[these])
     gross = gross_forces(slips)
     ratio = float(mean_seen(gross[:, 0] / gross[:, 1]))
-    kept = np.array([mean_seen((gross[:, 1] / held)[which == k]) for k in range(len(levels))])
+    retained = np.array([mean_seen((gross[:, 1] / held)[which == k]) for k in range(len(levels))])
     pull = ring_stiffness(slips, ring, growth)
     for r in range(pull.shape[1]):
         pull[~(mean_seen(lag[:, ring == r], axis=1) >= LEAST_PULLING_MM), r] = np.nan
-    return Lags(levels, ring, lag, error, normal, ratio, kept, stiffness, pull)
+    return Lags(levels, ring, lag, error, normal, ratio, retained, stiffness, pull)
 
 
 def spring_estimates(fit: Fit | None, ring: I64) -> dict[str, float]:

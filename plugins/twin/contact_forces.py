@@ -123,7 +123,7 @@ def force_estimates(slips: SlideSlips, lags: Lags) -> dict[str, float]:
     share, time = hold_relaxation(slips)
     return {
         "normal_n": float(lags.normal_n[-1]),
-        "normal_lost": 1.0 - float(lags.kept[-1]),
+        "normal_lost": 1.0 - float(lags.retained[-1]),
         "ratio": lags.ratio,
         "ratio_per_speed": _slope(np.log(slips.speed_mm_s), gross[:, 0] / gross[:, 1]),
         "stiffness_n_per_mm": float(lags.stiffness_n_per_mm[-1]),

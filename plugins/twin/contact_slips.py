@@ -86,14 +86,14 @@ def find_slips(trials: Sequence[PilotTrial]) -> SlideSlips | None:
     if not counts or max(counts) == 0:
         return None
     usual = max(set(counts), key=counts.count)
-    kept = tuple(trial for trial in trials if trial.tips_mm.shape[1] == usual)
-    found = [_slips_of(trial) for trial in kept]
+    retained = tuple(trial for trial in trials if trial.tips_mm.shape[1] == usual)
+    found = [_slips_of(trial) for trial in retained]
     noise, free, slipped, stretch, after, lag, frame_s, path = zip(*found, strict=True)
     return SlideSlips(
-        kept,
-        np.array([trial.slide.depth_mm for trial in kept]),
-        np.array([trial.slide.speed_mm_s for trial in kept]),
-        np.array([trial.slide.direction for trial in kept]),
+        retained,
+        np.array([trial.slide.depth_mm for trial in retained]),
+        np.array([trial.slide.speed_mm_s for trial in retained]),
+        np.array([trial.slide.direction for trial in retained]),
         np.array(noise),
         np.array(free),
         np.array(slipped),

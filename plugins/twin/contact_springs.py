@@ -72,7 +72,7 @@ class Lags:
     error_mm: F64
     normal_n: F64
     ratio: float
-    kept: F64
+    retained: F64
     stiffness_n_per_mm: F64
     pull_n_per_mm: F64
 
@@ -243,13 +243,13 @@ def _residuals(x: F64, lags: Lags, guess: Guess) -> F64:
         sticks = np.where(deep > 0.0, across, 0.0).sum(axis=2)
         in_ring = lags.ring[:, None] == np.arange(lags.ring.max() + 1)
         pull = young * ((grip * pressed) @ in_ring) / np.maximum(lag @ in_ring, 1e-6)
-        kept = pressed.sum(axis=2) / resting
+        retained = pressed.sum(axis=2) / resting
         ratio = (grip * pressed).sum(axis=2) / pressed.sum(axis=2)
         # a ring of few papillae has a small part in the force
         few = np.tile(0.1 / in_ring.sum(axis=0), len(lags.depth_mm))
         for model, seen, error in (
             (young[:, 0] * resting, lags.normal_n, 0.003),
-            (kept, lags.kept, 0.002),
+            (retained, lags.retained, 0.002),
             (young[:, 0] * sticks, lags.stiffness_n_per_mm, 0.02),
             (pull.reshape(len(x), -1), lags.pull_n_per_mm.ravel(), few),
             (ratio, np.full(len(lags.depth_mm), lags.ratio), 0.003),

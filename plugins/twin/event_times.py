@@ -108,8 +108,8 @@ def _same_column(column: Any, t_us: I64, lag: int, longest_us: int) -> F64:
         return np.empty(0)
     apart = t_us[lag:] - t_us[:-lag]
     # one us is what rounding makes of two events of one scan
-    kept = (column[lag:] == column[:-lag]) & (apart > 1) & (apart < longest_us)
-    return apart[kept][:: max(int(kept.sum()) // _PAIRS, 1)].astype(np.float64)
+    retained = (column[lag:] == column[:-lag]) & (apart > 1) & (apart < longest_us)
+    return apart[retained][:: max(int(retained.sum()) // _PAIRS, 1)].astype(np.float64)
 
 
 def _thinned(t_us: I64, x: Any) -> tuple[I64, Any]:

@@ -78,10 +78,10 @@ def event_map(trial: PilotTrial) -> F64:
         raise ValueError(f"{trial.trial}: has no events")
     events, (width, height) = trial.camera.events, trial.camera.size_px
     side = min(width, height)
-    kept = (events.p > 0) & (events.t_us >= 0) & (events.t_us < trial.slide_s * 1e6)
+    retained = (events.p > 0) & (events.t_us >= 0) & (events.t_us < trial.slide_s * 1e6)
     found, _, _ = np.histogram2d(
-        events.y[kept] - (height - side) / 2,
-        events.x[kept] - (width - side) / 2,
+        events.y[retained] - (height - side) / 2,
+        events.x[retained] - (width - side) / 2,
         bins=CELLS,
         range=[[0, side], [0, side]],
     )

@@ -227,7 +227,7 @@ class Prior:
 
 
 def simulated(
-    title: str, prior: Prior, slides: Slides, worlds: int, kept: Derived
+    title: str, prior: Prior, slides: Slides, worlds: int, saved: Derived
 ) -> list[SlideStatistics]:
     """Return what the prior's first worlds show of the slides.
 
@@ -249,7 +249,7 @@ def simulated(
     ]
     key = make_key("scene worlds", VERSION, wanted, [sorted(slides.with_events), *drawn_by])
     name = f"worlds-{key[:16]}"
-    found = _read(kept, name) if kept.fresh(name, key) else {}
+    found = _read(saved, name) if saved.fresh(name, key) else {}
     missing = [number for number in range(worlds) if number not in found]
 
     def keep(job: int, one: SlideStatistics) -> None:
@@ -259,12 +259,12 @@ def simulated(
         everywhere(title, DrawnWorld.statistics, [prior.world(k, slides) for k in missing], keep)
     finally:
         if missing and found:
-            _write(kept, name, key, found)
+            _write(saved, name, key, found)
     return [found[number] for number in range(worlds)]
 
 
-def _read(kept: Derived, name: str) -> dict[int, SlideStatistics]:
-    arrays = kept.arrays(name)
+def _read(saved: Derived, name: str) -> dict[int, SlideStatistics]:
+    arrays = saved.arrays(name)
     fitted, effects = (
         [dict(zip(arrays[f"{part}_names"].tolist(), row, strict=True)) for row in arrays[part]]
         for part in ("fitted", "effects")
@@ -275,14 +275,14 @@ def _read(kept: Derived, name: str) -> dict[int, SlideStatistics]:
     }
 
 
-def _write(kept: Derived, name: str, key: str, found: Mapping[int, SlideStatistics]) -> None:
+def _write(saved: Derived, name: str, key: str, found: Mapping[int, SlideStatistics]) -> None:
     arrays: dict[str, Any] = {"worlds": np.array(sorted(found))}
     for part in ("fitted", "effects"):
         rows: list[dict[str, float]] = [getattr(found[k], part) for k in sorted(found)]
         names = list(dict.fromkeys(key for row in rows for key in row))
         arrays[f"{part}_names"] = np.array(names)
         arrays[part] = np.array([[row.get(name, np.nan) for name in names] for row in rows])
-    kept.write(name, key, {"worlds": len(found)}, arrays)
+    saved.write(name, key, {"worlds": len(found)}, arrays)
 
 
 def everywhere(

@@ -280,5 +280,5 @@ def without_taught(data: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(calibration, dict):
         return data
     moved = {"contact_plane", "depth_zero", "max_age"}
-    kept = {key: value for key, value in calibration.items() if key not in moved}
-    return {**data, "calibration": kept}
+    retained = {key: value for key, value in calibration.items() if key not in moved}
+    return {**data, "calibration": retained}

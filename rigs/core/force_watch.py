@@ -257,10 +257,10 @@ class ForceWatch:
                 self._fresh_ns = int(t_ns[-1])
         t_ns = np.concatenate([self._t_ns, t_ns])
         first = int(np.searchsorted(t_ns, t_ns[-1] - _LINE_NS, side="right"))
-        kept = slice(max(min(first, len(t_ns) - _FEWEST), 0), None)
-        self._t_ns = t_ns[kept]
-        self._host_ns = np.concatenate([self._host_ns, host_ns])[kept]
-        self._normal_n = np.concatenate([self._normal_n, normal_n])[kept]
+        retained = slice(max(min(first, len(t_ns) - _FEWEST), 0), None)
+        self._t_ns = t_ns[retained]
+        self._host_ns = np.concatenate([self._host_ns, host_ns])[retained]
+        self._normal_n = np.concatenate([self._normal_n, normal_n])[retained]
 
 
 def _unusable(text: str) -> RigError:

@@ -106,7 +106,7 @@ class TrialRun:
     @property
     def recorded_ns(self) -> tuple[int, int]:
         """Start and end of the recorded steps on the arm's clock."""
-        recorded = [step for step, kept in self.steps if kept]
+        recorded = [step for step, retained in self.steps if retained]
         return recorded[0].start_ns, recorded[-1].end_ns
 
 
@@ -337,7 +337,7 @@ class Rig:
                     path.append(self._segment(times, began, course.at, speed))
             truth = None
             if self.simulation is not None:
-                hold = next(times.start_ns for times, kept in steps if kept)
+                hold = next(times.start_ns for times, retained in steps if retained)
                 truth = self.simulation.truth(reference, hold)
             return TrialRun(
                 tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), course.pressed_mm

@@ -61,8 +61,8 @@ class FakeArmPath(ArmPath):
         """Begin a trial whose time 0 is the total time `past_ns`; older lines are discarded."""
         with self._lock:
             self._past_ns, self.cut_ns = past_ns, None
-            kept = [line for line in self._lines if line.since_ns > past_ns]
-            self._lines = [*self._lines[: len(self._lines) - len(kept)][-1:], *kept]
+            retained = [line for line in self._lines if line.since_ns > past_ns]
+            self._lines = [*self._lines[: len(self._lines) - len(retained)][-1:], *retained]
 
     def restart(self, now_ns: int) -> None:
         """Keep the lines, which continue; `begin` discards them."""

@@ -53,10 +53,10 @@ class ToolLoad:
         about_tip = torque - np.cross(sensor[:, :3] * 1e-3, force)
         axes = self._world.plane.rotation
         load = -np.hstack([force @ axes.T, about_tip @ axes.T])
-        kept = self._known[0] > times[-1] - KEPT_S
+        retained = self._known[0] > times[-1] - KEPT_S
         self._known = (
-            np.concatenate([self._known[0][kept], times]),
-            np.concatenate([self._known[1][kept], load]),
+            np.concatenate([self._known[0][retained], times]),
+            np.concatenate([self._known[1][retained], load]),
         )
         before, self._beyond = self._beyond, bool(np.abs(force).max() > self._range_n)
         return self._beyond and not before

@@ -65,11 +65,11 @@ class Bursts:
             low, high = max(begin_ns - scans.period_ns, first_ns), min(end_ns, last_ns)
             for number in range(low // bin_ns, high // bin_ns + 1 if high >= low else 0):
                 t_ns, x, y, p = events_of(number)
-                kept = (t_ns >= first_ns) & (t_ns < last_ns)
+                retained = (t_ns >= first_ns) & (t_ns < last_ns)
                 if scans.period_ns:
                     t_ns = scans.begin(t_ns)
-                kept &= (t_ns > begin_ns) & (t_ns <= end_ns)
-                t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
+                retained &= (t_ns > begin_ns) & (t_ns <= end_ns)
+                t_ns, x, y, p = t_ns[retained], x[retained], y[retained], p[retained]
                 parts.append((scans.stamp(t_ns, x), x, y, p))
         return _merge(parts)
 
@@ -197,8 +197,8 @@ class MockEventCamera:
         loads.forget(last_ns)
         gaps = [(t_ns[0], self._begun_ns)] if len(t_ns) and t_ns[0] < self._begun_ns else []
         for begin, end in [*gaps, *self._gaps_ns()]:
-            kept = (t_ns < begin) | (t_ns >= end)
-            t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
+            retained = (t_ns < begin) | (t_ns >= end)
+            t_ns, x, y, p = t_ns[retained], x[retained], y[retained], p[retained]
         stamps = self.clock.to_reference(t_ns) // 1000
         return EventChunk(x, y, p, self._stamps.of(stamps))
 
@@ -227,10 +227,10 @@ class MockEventCamera:
         t_ns = self._input.edges_ns(self._sent_until_ns())
         if not self._running and self._until_ns == 0:
             return PulseChunk(np.empty(0, np.int64))
-        kept = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
+        retained = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
         for begin, end in self._gaps_ns():
-            kept &= (t_ns < begin) | (t_ns >= end)
-        stamp = self.clock.to_reference(t_ns[kept])
+            retained &= (t_ns < begin) | (t_ns >= end)
+        stamp = self.clock.to_reference(t_ns[retained])
         return PulseChunk(stamp // 1000 * 1000)
 
     def stop(self) -> None:

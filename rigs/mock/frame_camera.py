@@ -139,9 +139,9 @@ class MockFrameCamera:
         self._next_tick += len(ticks)
         self._number += len(ticks)
         self._arrived_ns = max(self._arrived_ns, int(host.max(initial=0)))
-        kept = ~self._faults.lost(ticks)
-        mid = true[: len(ticks)][kept] + self.mid_exposure_ns
-        ticks, number, host = ticks[kept], number[kept], host[kept]
+        retained = ~self._faults.lost(ticks)
+        mid = true[: len(ticks)][retained] + self.mid_exposure_ns
+        ticks, number, host = ticks[retained], number[retained], host[retained]
         stamp = host
         if not self.timed_by_host:
             stamp = self.clock.to_reference(mid + self._jitter.ns(ticks))

@@ -89,12 +89,12 @@ class GrowingTable:
         """Drop the rows that are not needed for times from `before_ns` on."""
         times = self._t_ns[: self._length]
         drop = max(int(np.searchsorted(times, before_ns, side="right")) - 1, 0)
-        kept = self._length - drop
+        retained = self._length - drop
         # compact while that is cheap, so that the next reads hit the cache
-        if drop > max(_FEW, kept):
-            self._rows[:kept] = self._rows[drop : self._length].copy()
-            self._t_ns[:kept] = times[drop:].copy()
-            self._length = kept
+        if drop > max(_FEW, retained):
+            self._rows[:retained] = self._rows[drop : self._length].copy()
+            self._t_ns[:retained] = times[drop:].copy()
+            self._length = retained
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -245,14 +245,14 @@ class ArmPath:
 
     def cut(self, now_ns: int) -> None:
         """Stop at `now_ns`."""
-        kept = [leg for leg in self.legs if leg.start_ns < now_ns]
-        if kept and kept[-1].end_ns > now_ns:
-            leg = kept[-1]
+        retained = [leg for leg in self.legs if leg.start_ns < now_ns]
+        if retained and retained[-1].end_ns > now_ns:
+            leg = retained[-1]
             here = leg.at(np.array([now_ns], np.int64))[0]
             # the path up to here stays bit-identical
             planned = leg.planned or (leg.end_ns, leg.end)
-            kept[-1] = replace(leg, end_ns=now_ns, end=here, planned=planned)
-        self.legs = kept
+            retained[-1] = replace(leg, end_ns=now_ns, end=here, planned=planned)
+        self.legs = retained
         if self.deviation is not None:
             self.deviation.freeze(now_ns)
 

@@ -358,8 +358,8 @@ class _PulseFaults:
         """
         if self._whole:
             return true_ns, stamps
-        kept = ~np.isin(ticks, self._hit(PulsesLost)[0])
-        ticks, pulses = ticks[kept], np.stack([true_ns[kept], stamps[kept]])
+        retained = ~np.isin(ticks, self._hit(PulsesLost)[0])
+        ticks, pulses = ticks[retained], np.stack([true_ns[retained], stamps[retained]])
         if not self._reorders:
             return pulses[0], pulses[1]
         hit, late_ns = self._hit(PulsesLate)

@@ -703,10 +703,10 @@ def _let_go(w: Block, law: Law, j: int, step: ContactStep) -> None:
     w.share[j], w.held[j] = touched + (1.0 - touched) * share, share
     w.slides_s[j] = (1.0 - share) * (1.0 - touched) * step.h
     # up to where it lets go the force goes from one end to `from`, then from what is left of that
-    kept = force_kept(
+    retained = force_kept(
         np.sqrt(from_x * from_x + from_y * from_y), before, w.across[j] * law.damping_s, law
     )
-    w.kick[j] = from_y * (share + (1.0 - share) * kept) - (1.0 - share) * w.force_y[j]
+    w.kick[j] = from_y * (share + (1.0 - share) * retained) - (1.0 - share) * w.force_y[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -445,7 +445,7 @@ def trace(
     xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
     waiting = pending.shape[0]
     # with a literal numba would compile what takes them twice
-    kept, begin = np.int64(0), np.int64(0)
+    stored, begin = np.int64(0), np.int64(0)
     lead_ns = period_ns + np.int64(width * column_ns)
     noise_at = np.searchsorted(noise_t, row_ns[0])
     events[:waiting] = pending
@@ -613,12 +613,12 @@ def trace(
                     break
             if listed:
                 renew(i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim)
-        if kept + n > room:
-            room = 2 * (kept + n)
+        if stored + n > room:
+            room = 2 * (stored + n)
             t_ns, ps = larger(t_ns, room), larger(ps, room)
             xs, ys = larger(xs, room), larger(ys, room)
         if period_ns > 0:
-            kept, waiting = read_scans(
+            stored, waiting = read_scans(
                 events,
                 n,
                 other,
@@ -633,12 +633,12 @@ def trace(
                 xs,
                 ys,
                 ps,
-                kept,
+                stored,
             )
             for k in range(waiting):
                 events[k] -= (end_ns - row_ns[begin]) << 25
         else:
-            kept = read_each(
+            stored = read_each(
                 events,
                 n,
                 other,
@@ -650,13 +650,13 @@ def trace(
                 xs,
                 ys,
                 ps,
-                kept,
+                stored,
             )
         begin = stop
     return (
-        t_ns[:kept].copy(),
-        xs[:kept].copy(),
-        ys[:kept].copy(),
-        ps[:kept].copy(),
+        t_ns[:stored].copy(),
+        xs[:stored].copy(),
+        ys[:stored].copy(),
+        ps[:stored].copy(),
         events[:waiting].copy(),
     )

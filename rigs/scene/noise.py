@@ -162,7 +162,7 @@ def noise_events(
     t_ns, place, lot = candidates
     k = begin
     while k < t_ns.shape[0] and t_ns[k] < end_ns:
-        positive, kept = True, True
+        positive, retained = True, True
         if lot[k] >= leak_below:
             # the same lot says which polarity, and whether the pixel is too bright for it
             turn = 2.0 * (lot[k] - leak_below) / (1.0 - leak_below)
@@ -171,8 +171,8 @@ def noise_events(
                 turn -= 1.0
             if turn >= BRIGHT_SHARE:
                 bright = brightness(place[k] >> 12, place[k] & 4095, discs, contrast, edge)
-                kept = turn < 1.0 - (1.0 - BRIGHT_SHARE) * bright
-        if kept:
+                retained = turn < 1.0 - (1.0 - BRIGHT_SHARE) * bright
+        if retained:
             events[n] = (t_ns[k] - base_ns) << 25 | place[k] << 1 | np.int64(positive)
             n += 1
         k += 1

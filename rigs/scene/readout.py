@@ -92,7 +92,7 @@ def read_each(
     xs: U16,
     ys: U16,
     ps: U8,
-    kept: int,
+    retained: int,
 ) -> int:
     """Deliver a block's events with their own times.
 
@@ -114,9 +114,9 @@ def read_each(
         if t - fired[y, x] < refractory_ns:
             continue
         fired[y, x] = t
-        t_ns[kept], xs[kept], ys[kept], ps[kept] = t, x, y, event & 1
-        kept += 1
-    return kept
+        t_ns[retained], xs[retained], ys[retained], ps[retained] = t, x, y, event & 1
+        retained += 1
+    return retained
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -135,7 +135,7 @@ def read_scans(
     xs: U16,
     ys: U16,
     ps: U8,
-    kept: int,
+    retained: int,
 ) -> tuple[int, int]:
     """Deliver the scans that are read to their last column by `end_ns`; see `read_each`.
 
@@ -186,10 +186,10 @@ def read_scans(
         if t - before < refractory_ns or before > begin - period_ns:
             continue
         fired[y, x] = t
-        t_ns[kept], xs[kept] = begin + np.int64(x * column_ns), x
-        ys[kept], ps[kept] = y, key & 1
-        kept += 1
-    return kept, left
+        t_ns[retained], xs[retained] = begin + np.int64(x * column_ns), x
+        ys[retained], ps[retained] = y, key & 1
+        retained += 1
+    return retained, left
 
 
 _BITS = 9

@@ -147,9 +147,9 @@ class AdaptedCampaign:
                 campaign.name,
                 "is a campaign that did not come by an adapter; choose another name",
             )
-        kept = load_adapter(campaign.protocol_file).of_the_trials()
+        stored = load_adapter(campaign.protocol_file).of_the_trials()
         new = self.found.adapter.of_the_trials()
-        differing = [key for key in new if new[key] != kept.get(key)]
+        differing = [key for key in new if new[key] != stored.get(key)]
         if differing:
             raise InputError(
                 self.found.file,

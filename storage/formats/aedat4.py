@@ -112,20 +112,21 @@ class Aedat4File:
             self._codec = _CODECS.get(table.number(0, "<i"), "")
             if self._codec == "":
                 raise FormatError("has an unknown compression")
-            said = table.number(1, "<q", -1)
+            stated = table.number(1, "<q", -1)
             self.at = self._begin = self._handle.tell()
-            self._end = self._bytes if said <= 0 else said
+            self._end = self._bytes if stated <= 0 else stated
             self._short = (
-                f"is cut short: its header puts the end of its packets at byte {said}, and it has "
+                f"is cut short: its header puts the end of its packets at byte {stated}, "
+                "and it has "
                 f"{self._bytes} bytes"
-                if said > self._bytes
+                if stated > self._bytes
                 else None
             )
             if end is not None:
                 self._end = min(self._end, end)
             if not self._begin <= self._end <= self._bytes:
                 raise Damage(self._short or f"puts the end of its packets at byte {self._end}")
-            self._table = said if 0 < said < self._bytes else None
+            self._table = stated if 0 < stated < self._bytes else None
             self.streams = _streams(bytes(table.vector(2, 1)[1]))
         except BaseException:
             self._handle.close()

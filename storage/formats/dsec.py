@@ -254,8 +254,8 @@ def _whole_rows(
     """
     size = path.stat().st_size
     lengths = {key: len(column) for key, column in columns.items()}
-    said, count = max(lengths.values()), min(lengths.values())
-    reason = None if said == count else f"has event columns of different lengths: {lengths}"
+    given, count = max(lengths.values()), min(lengths.values())
+    reason = None if given == count else f"has event columns of different lengths: {lengths}"
     for key, column in columns.items():
         if (row := _rows_inside(column, count, size)) < count:
             count, reason = row, f"is cut short in the column events/{key}, at row {row}"
@@ -276,7 +276,7 @@ def _whole_rows(
     left = [one for column in columns.values() for one in _unread(column, count, size)]
     at = min((place for place, _ in left), default=size)
     unread = sum(length for _, length in left)
-    return count, Lost(at_byte=at, unread_bytes=unread, reason=reason, events=said - count)
+    return count, Lost(at_byte=at, unread_bytes=unread, reason=reason, events=given - count)
 
 
 def _rows_inside(column: Hdf5Column, count: int, size: int) -> int:

@@ -67,7 +67,7 @@ def export_trials(
 
 def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
     record = recording.record
-    kept = record.model_dump(
+    stored = record.model_dump(
         mode="json", include={"experiment", "role", "clocks", "steps"}, exclude_unset=True
     )
     return {
@@ -75,7 +75,7 @@ def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
         "file": name,
         "condition": record.condition,
         "repetition": record.repetition,
-        "record": kept,
+        "record": stored,
         **counts,
     }
 
@@ -86,11 +86,11 @@ def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
     Nested values become columns with a dot in their names; lists are left out. Values that are not
     in every label are missing, and integers stay integers.
     """
-    kept = Derived.of(store, LABELS, campaign)
+    stored = Derived.of(store, LABELS, campaign)
     rows: list[Json] = []
     for trial in trials:
         try:
-            found = kept.read(trial)
+            found = stored.read(trial)
         except FileNotFoundError:
             continue
         rows.append({"campaign": campaign, "trial": trial, **_flat(found, "")})

@@ -258,9 +258,9 @@ class _Content:
         """
         order = self.orders.get(stream)
         if order is not None:
-            kept = order[done : done + len(times)]
-            self.leave_out(f"{_rows_of(stream)} {BACK}", int((~kept).sum()))
-            return kept
+            retained = order[done : done + len(times)]
+            self.leave_out(f"{_rows_of(stream)} {BACK}", int((~retained).sum()))
+            return retained
         if falls(times) or (last is not None and len(times) and times[0] < last):
             raise _RunsBack
         return slice(None)
@@ -270,7 +270,7 @@ class _Content:
         if count:
             self.left_out[reason] += count
 
-    def check_majority(self, stream: str, kept: int) -> None:
+    def check_majority(self, stream: str, retained: int) -> None:
         """Check that few rows of a stream cannot be right. Raises FormatError."""
         what = _rows_of(stream)
         wrong = {
@@ -279,7 +279,7 @@ class _Content:
             if reason.startswith(f"{what} ") and not reason.endswith(BACK)
         }
         count = sum(wrong.values())
-        if count and (count >= kept or count > max(_SOME, _SHARE * (kept + count))):
+        if count and (count >= retained or count > max(_SOME, _SHARE * (retained + count))):
             named = ", ".join(f"{count:,} {reason}" for reason, count in wrong.items())
             if set(wrong) == {OUTSIDE} and self.size_px is not None:
                 (width, height), (column, row) = self.size_px, self.latest_px
@@ -291,14 +291,14 @@ class _Content:
                     f"{count:,} {where}, outside of the {width} x {height} pixels that the file "
                     "gives its camera"
                 )
-            raise FormatError(f"{what}: {named}; {kept:,} can be right")
+            raise FormatError(f"{what}: {named}; {retained:,} can be right")
 
-    def check_order(self, stream: str, kept: int, rows: int) -> None:
+    def check_order(self, stream: str, retained: int, rows: int) -> None:
         """Check that enough rows of a stream are in order of time. Raises FormatError."""
-        if kept < rows and kept < max(2, _LEAST_SHARE * rows):
+        if retained < rows and retained < max(2, _LEAST_SHARE * rows):
             raise FormatError(
-                f"contains {_rows_of(stream)} with decreasing times: {kept:,} of {rows:,} are in "
-                "order"
+                f"contains {_rows_of(stream)} with decreasing times: {retained:,} of {rows:,} "
+                "are in order"
             )
 
     def check_times(
@@ -484,10 +484,10 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> DataSp
     for chunk in _events(trial, content):
         if isinstance(chunk, ForeignChunk):
             resolution = max(resolution, chunk.resolution_us)
-        kept = content.ordered(EVENTS_KIND, chunk.t_us, done, last_us)
+        retained = content.ordered(EVENTS_KIND, chunk.t_us, done, last_us)
         done += len(chunk)
-        if not isinstance(kept, slice):
-            chunk = some_rows(chunk, kept)
+        if not isinstance(retained, slice):
+            chunk = some_rows(chunk, retained)
         if not len(chunk):
             continue
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
@@ -526,9 +526,9 @@ def _fill_triggers(writer: TrialWriter, trial: ForeignTrial, content: _Content) 
     content.leave_out(NO_TIME.format("triggers"), int((~good).sum()))
     content.check_majority("triggers", int(good.sum()))
     t_us, kind = t_us[good], kind[good]
-    kept = in_order(t_us)
-    content.leave_out(f"triggers {BACK}", int((~kept).sum()))
-    t_ns, kind = t_us[kept] * 1000, kind[kept]
+    retained = in_order(t_us)
+    content.leave_out(f"triggers {BACK}", int((~retained).sum()))
+    t_ns, kind = t_us[retained] * 1000, kind[retained]
     writer.add_triggers(t_ns, kind)
     writer.add_event_pulses(PulseChunk(t_ns[kind == RISING]))
 
@@ -569,9 +569,9 @@ def _fill_frames(
     image = None
     done = alike = repeated = 0
     for chunk in _frames(stream, read, size, content):
-        kept = content.ordered(stream, chunk.t_ns, done, None if ends is None else ends[1])
+        retained = content.ordered(stream, chunk.t_ns, done, None if ends is None else ends[1])
         done += len(chunk)
-        chunk = chunk if isinstance(kept, slice) else some_rows(chunk, kept)
+        chunk = chunk if isinstance(retained, slice) else some_rows(chunk, retained)
         if not len(chunk):
             continue
         size = size or (chunk.images.shape[2], chunk.images.shape[1])
@@ -630,11 +630,11 @@ def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) 
     content.check_majority(name, int(good.sum()))
     if not good.all():
         chunk = some_rows(chunk, good)
-    kept = in_order(chunk.t_ns)
-    if not kept.all():
-        content.leave_out(f"{what} {BACK}", int((~kept).sum()))
-        content.check_order(name, int(kept.sum()), len(kept))
-        chunk = some_rows(chunk, kept)
+    retained = in_order(chunk.t_ns)
+    if not retained.all():
+        content.leave_out(f"{what} {BACK}", int((~retained).sum()))
+        content.check_order(name, int(retained.sum()), len(retained))
+        chunk = some_rows(chunk, retained)
     content.rows[name] = len(chunk)
     if len(chunk):
         ends = int(chunk.t_ns[0]), int(chunk.t_ns[-1])

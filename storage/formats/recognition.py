@@ -77,9 +77,9 @@ def kind_of(path: Path) -> str:
         return whole
     found = _sort(path)
     if not found:
-        said = [(file, what) for file in _files(path) if (what := unread(file)) is not None]
-        if said:
-            raise InputError(said[0][0], "", None, said[0][1])
+        stated = [(file, what) for file in _files(path) if (what := unread(file)) is not None]
+        if stated:
+            raise InputError(stated[0][0], "", None, stated[0][1])
         text = f"contains no known file format; name one of {', '.join(format_names())}"
         raise InputError(path, "", None, "; ".join([text, *unusable_formats()]))
     kinds = {files.kind for _, files in found}

@@ -76,10 +76,10 @@ def in_order(times: I64) -> Mask:
 
 def _consistent(times: I64) -> Mask:
     """Return the longest consistent part of times that repeat none."""
-    kept: Mask = _longest(np.ascontiguousarray(times, np.int64))
-    at = _restart(times, kept)
+    retained: Mask = _longest(np.ascontiguousarray(times, np.int64))
+    at = _restart(times, retained)
     if at is None:
-        return kept
+        return retained
     parts = [in_order(times[:at]), in_order(times[at:])]
     parts[int(parts[0].sum() >= parts[1].sum())][:] = False
     return np.concatenate(parts)
@@ -110,14 +110,14 @@ def _longest_run(times: I64) -> Mask:
     """Return the longest run of rows without a step back."""
     ends = [0, *np.flatnonzero(times[1:] < times[:-1]) + 1, len(times)]
     at = int(np.diff(ends).argmax())
-    kept = np.zeros(len(times), np.bool_)
-    kept[ends[at] : ends[at + 1]] = True
-    return kept
+    retained = np.zeros(len(times), np.bool_)
+    retained[ends[at] : ends[at + 1]] = True
+    return retained
 
 
-def _restart(times: I64, kept: Mask) -> int | None:
+def _restart(times: I64, retained: Mask) -> int | None:
     """Return the row at which the clock restarted; None where it did not."""
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(retained)
     gaps = np.diff(rows) - 1
     for gap in np.flatnonzero(gaps > _RESTART_SHARE * len(times)):
         low, high = int(rows[gap]), int(rows[gap + 1])
@@ -150,9 +150,9 @@ def _longest(times: Any) -> Any:
         before[row] = last[low - 1] if low else -1
         last[low] = row
         count = max(count, low + 1)
-    kept = np.zeros(len(times), np.bool_)
+    retained = np.zeros(len(times), np.bool_)
     row = last[count - 1] if count else -1
     while row >= 0:
-        kept[row] = True
+        retained[row] = True
         row = before[row]
-    return kept
+    return retained

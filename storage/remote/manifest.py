@@ -123,8 +123,8 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
     """
     try:
         found = json.loads(data)
-        said = found.pop("sum")
-        sealed = said == hash_data(found)
+        given = found.pop("sum")
+        sealed = given == hash_data(found)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise RemoteError(f"{where}: is not a manifest, or is incomplete") from None
     if isinstance(found.get("format"), int) and found["format"] > FORMAT:

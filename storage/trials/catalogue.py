@@ -212,19 +212,21 @@ class _CampaignRows:
         self.campaign, self.listing = campaign, listing
         low, high, stamp = known.bounds.get(campaign.name, (0, 0, ""))
         names, keys = known.names[low:high], known.keys[low:high]
-        self.kept = dict(zip(names, range(low, high), strict=True))
+        self.retained = dict(zip(names, range(low, high), strict=True))
         if names != listing.names or not np.array_equal(keys, listing.keys):
             now = dict(zip(listing.names, map(tuple, listing.keys.tolist()), strict=True))
             before = zip(names, map(tuple, keys.tolist()), strict=True)
-            self.kept = {name: self.kept[name] for name, key in before if now.get(name) == key}
+            self.retained = {
+                name: self.retained[name] for name, key in before if now.get(name) == key
+            }
         same_clocks = bool(stamp) and stamp == listing.sync
         self.sync: dict[str, str] = {}
         if not same_clocks:
             old = known.sync()
             self.sync = {name: _sync_key(campaign, name) for name in listing.names}
-            self.kept = {n: at for n, at in self.kept.items() if self.sync[n] == old[at]}
+            self.retained = {n: at for n, at in self.retained.items() if self.sync[n] == old[at]}
         self.fresh: dict[str, Row] = {}
-        self.changed = len(self.kept) != high - low or not same_clocks
+        self.changed = len(self.retained) != high - low or not same_clocks
 
     def look(self, strict: bool) -> list[str]:
         """Read the trials that are not in the index; return a line for each that is damaged.
@@ -234,7 +236,7 @@ class _CampaignRows:
         """
         damaged, broken = [], []
         for name in self.listing.names:
-            if name in self.kept:
+            if name in self.retained:
                 continue
             folder = self.campaign.folder / "trials" / name
             if (cause := incomplete(folder)) is not None:
@@ -264,7 +266,7 @@ def _rebuilt(
     for part in parts:
         first = len(rows)
         for name, key in zip(part.listing.names, part.listing.settled(began_ns), strict=True):
-            at = part.kept.get(name)
+            at = part.retained.get(name)
             if at is None and name not in part.fresh:
                 continue  # damaged
             rows.append(part.fresh[name] if at is None else old_rows[at])

@@ -270,24 +270,24 @@ class RowFile:
         data = h5py.h5o.open(self._file, self._place(name))
         if not isinstance(data, h5py.h5d.DatasetID):
             raise NotOurs(f"{self.path}: {name} is no column")
-        kept = data.get_create_plist()
-        layout = kept.get_layout()
-        if layout == h5py.h5d.VIRTUAL or kept.get_external_count():
+        retained = data.get_create_plist()
+        layout = retained.get_layout()
+        if layout == h5py.h5d.VIRTUAL or retained.get_external_count():
             raise NotOurs(f"{self.path}: {name} points outside the file")
         if (dtype := _plain(data, _NUMBERS)) is None:
             raise NotOurs(f"{self.path}: {name} does not contain numbers")
         rows = Hdf5Column(data, f"{self.path}: {name}", dtype)
         value = rows.dtype.itemsize
         stated = value * math.prod(rows.shape)
-        if stated > _LARGE and (stored := _stored_bytes(data, kept)) < stated:
+        if stated > _LARGE and (stored := _stored_bytes(data, retained)) < stated:
             raise NotOurs(f"{self.path}: {name} has {stored} of its {stated} bytes")
         if layout == h5py.h5d.CHUNKED:
-            chunk = kept.get_chunk()
+            chunk = retained.get_chunk()
             if max(_LARGE, 2 * stated) < value * math.prod(chunk):
                 raise NotOurs(
                     f"{self.path}: {name} is stored in pieces of {chunk} for {rows.shape}"
                 )
-            filters = [kept.get_filter(number) for number in range(kept.get_nfilters())]
+            filters = [retained.get_filter(number) for number in range(retained.get_nfilters())]
             rows.pack(chunk, [(kind, options) for kind, _, options, _ in filters])
         return rows
 
@@ -331,11 +331,11 @@ def _plain(found: Any, kinds: str) -> np.dtype[Any] | None:
     return dtype
 
 
-def _stored_bytes(data: Any, kept: Any) -> int:
+def _stored_bytes(data: Any, retained: Any) -> int:
     """Return how many bytes of a dataset are in the file, at most, once they are unpacked."""
-    if kept.get_layout() != h5py.h5d.CHUNKED:
+    if retained.get_layout() != h5py.h5d.CHUNKED:
         return int(data.get_storage_size())
-    return int(data.get_num_chunks() * math.prod(kept.get_chunk()) * data.dtype.itemsize)
+    return int(data.get_num_chunks() * math.prod(retained.get_chunk()) * data.dtype.itemsize)
 
 
 def _attribute(of: Any, name: str) -> Array | None:
@@ -434,16 +434,16 @@ class Hdf5Column:
         The place is None where the file has none for a piece. Each is read once, for the file's
         index of them may be damaged.
         """
-        kept = self._data.get_create_plist()
+        retained = self._data.get_create_plist()
         row, others = self.dtype.itemsize * math.prod(self.shape[1:]), (0,) * len(self.shape[1:])
-        if kept.get_layout() == h5py.h5d.CHUNKED:
-            for low in range(0, len(self), kept.get_chunk()[0]):
+        if retained.get_layout() == h5py.h5d.CHUNKED:
+            for low in range(0, len(self), retained.get_chunk()[0]):
                 found = self._data.get_chunk_info_by_coord((low, *others))
                 # in a damaged index that search may find what reading does not, which then returns
                 # zeros; this call fails instead
                 self._data.read_direct_chunk((low, *others))
                 yield low, found.size, found.byte_offset or None
-        elif kept.get_layout() == h5py.h5d.CONTIGUOUS:
+        elif retained.get_layout() == h5py.h5d.CONTIGUOUS:
             place = self._data.get_offset()
             for low in range(0, len(self), _BLOCK):
                 rows = min(_BLOCK, len(self) - low)

@@ -60,13 +60,13 @@ def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
     return passed
 
 
-def kept(store: Store, number: int) -> Path:
+def retained(store: Store, number: int) -> Path:
     """Return the folder with copies of what the migration from a format changed."""
     return store.folder / "before" / f"format-{number}"
 
 
 def _keep(store: Store, number: int) -> None:
-    folder = kept(store, number)
+    folder = retained(store, number)
     if (folder / STORE).exists():
         return  # complete: it is copied last
     for path in _changeable(store):

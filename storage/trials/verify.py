@@ -318,9 +318,9 @@ def content_problems(folder: Path, record: TrialRecord) -> Found:
         "pulses": counts["sync_pulses/t"],
     }
     for name, count in found.items():
-        said = getattr(record.counts, name)
-        if count != said:
-            problems.append((folder / DATA, f"{count} {name}, the record says {said}"))
+        given = getattr(record.counts, name)
+        if count != given:
+            problems.append((folder / DATA, f"{count} {name}, the record says {given}"))
     problems += _frame_problems(folder / DATA, folder / FRAMES, tracks, counts)
     if not record.quality.passed and record.imported is None:
         problems.append((folder / RECORD, "was committed although a gate failed"))
@@ -354,23 +354,26 @@ def _data_problems(
 def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) -> Found:
     """Check the named streams: those that the record counts, whole, and in order of time."""
     kinds, counts = reader.streams(), reader.stream_counts()
-    stated = {name: said for name, said in record.streams.items() if not said.of_camera}
+    stated = {name: given for name, given in record.streams.items() if not given.of_camera}
     problems: Found = []
     for name in sorted(kinds.keys() | stated.keys()):
         path = f"{STREAM_GROUP}/{name}"
-        said = stated.get(name)
-        if said is None or name not in kinds:
-            where = "the record" if said is None else "the file"
+        given = stated.get(name)
+        if given is None or name not in kinds:
+            where = "the record" if given is None else "the file"
             problems.append((folder / DATA, f"{path} is not in {where}"))
             continue
-        if kinds[name] != said.kind:
-            what = f"{path} is of kind '{kinds[name]}', the record says '{said.kind}'"
+        if kinds[name] != given.kind:
+            what = f"{path} is of kind '{kinds[name]}', the record says '{given.kind}'"
             problems.append((folder / DATA, what))
             continue
         problems += [
-            (folder / DATA, f"{plural(count, 'row')} of {path}/{part}, the record says {said.rows}")
+            (
+                folder / DATA,
+                f"{plural(count, 'row')} of {path}/{part}, the record says {given.rows}",
+            )
             for part, count in counts[name].items()
-            if count != said.rows
+            if count != given.rows
         ]
         if np.any(np.diff(reader.column(f"{path}/t")) < 0):
             problems.append((folder / DATA, f"{path}/t runs backwards"))
@@ -379,7 +382,7 @@ def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) ->
 
 def _camera_problems(folder: Path, record: TrialRecord) -> Found:
     """Check the streams of further cameras: those that the record counts, in order of time."""
-    stated = {name for name, said in record.streams.items() if said.of_camera}
+    stated = {name for name, given in record.streams.items() if given.of_camera}
     found = {
         match["stream"] for path in folder.iterdir() if (match := STREAM_FILE.fullmatch(path.name))
     }
@@ -389,7 +392,7 @@ def _camera_problems(folder: Path, record: TrialRecord) -> Found:
     ]
     for name in sorted(stated):
         data, video = folder / stream_file(name), folder / stream_file(name, "mkv")
-        said = record.streams[name]
+        given = record.streams[name]
         if not data.is_file():
             problems.append((data, "is missing, the record has its stream"))
             continue
@@ -401,9 +404,9 @@ def _camera_problems(folder: Path, record: TrialRecord) -> Found:
                 for column in ("events/t", "event_pulses/t", "frames/t")
                 if np.any(np.diff(reader.column(column)) < 0)
             ]
-            pixels = said.size_px if said.kind == EVENTS_KIND else None
+            pixels = given.size_px if given.kind == EVENTS_KIND else None
             problems += _data_problems(data, reader, counts, pixels)
-        stated_rows = {f"{said.kind}/t": said.rows, "event_pulses/t": said.pulses or 0}
+        stated_rows = {f"{given.kind}/t": given.rows, "event_pulses/t": given.pulses or 0}
         problems += [
             (data, f"{plural(counts[column], 'row')} of {column}, the record says {rows}")
             for column, rows in stated_rows.items()
@@ -469,9 +472,9 @@ def quarantine_damaged(store: Store, problems: list[Problem]) -> list[str]:
             what = f"{Path(problem.path).name}: {problem.what}"
             causes.setdefault((problem.campaign, problem.trial), []).append(what)
     moved = []
-    for (name, trial), said in causes.items():
+    for (name, trial), given in causes.items():
         folder = store.campaign(name).folder / "trials" / trial
         if folder.is_dir() and not folder.is_symlink():
-            store.campaign(name).quarantine(folder, f"damaged: {'; '.join(said)}")
+            store.campaign(name).quarantine(folder, f"damaged: {'; '.join(given)}")
             moved.append(trial)
     return moved

@@ -61,10 +61,10 @@ def test_only_the_entry_changes(path: Path, tmp_path: Path) -> None:
     assert comments == [line.split("#", 1)[1] for line in after if "#" in line]
     plane = load_rig_file(path)[0].calibration.contact_plane
     assert (plane.taught, plane.residual, plane.method) == (DAY, 0.02, "touches")
-    assert written.kept == tmp_path / "lab.before-2026-12-01.yaml"
-    assert written.kept.read_text() == MOCK
+    assert written.retained == tmp_path / "lab.before-2026-12-01.yaml"
+    assert written.retained.read_text() == MOCK
     again = write_entries(path, path, {}, today=DAY)
-    assert again.kept.name == "lab.before-2026-12-01-2.yaml"
+    assert again.retained.name == "lab.before-2026-12-01-2.yaml"
 
 
 def test_a_result_that_is_no_rig_file_is_not_written(path: Path, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_elsewhere_an_extending_file_is_written_merged(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     target = tmp_path / "there" / "new.yaml"
     written = write_entries(path, target, {"calibration.contact_plane": PLANE}, today=DAY)
-    assert written.kept is None
+    assert written.retained is None
     assert "extends" not in parse_yaml(target.read_text(), target)
     assert load_rig_file(target)[0].name == "child"
 

@@ -85,9 +85,9 @@ def by_condition(
                 axes.axvline(0, color=GREY, lw=0.8)
             lines = [panel.zero and f"0: {panel.zero}"]
             if panel.published is not None:
-                value, said = panel.published
+                value, stated = panel.published
                 axes.axvline(value, color="black", lw=0.9, ls=":")
-                lines.append(f"dotted: {said}")
+                lines.append(f"dotted: {stated}")
             axes.set_title("\n".join(line for line in lines if line), fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)

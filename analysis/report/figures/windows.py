@@ -55,8 +55,8 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
             text = f"{100 * share[i, j]:.1f} %\n{value}"
             colour = "white" if share[i, j] > 0.6 else "black"
             axes.text(j, i, text, ha="center", va="center", fontsize=8, color=colour)
-        said = [*CLASS_WORDS, "undecided"]
-        name_cells(axes, CLASS_WORDS, said, "true class", "predicted class")
+        stated = [*CLASS_WORDS, "undecided"]
+        name_cells(axes, CLASS_WORDS, stated, "true class", "predicted class")
         return svg_text(figure, simulated)
 
 

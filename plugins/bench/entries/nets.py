@@ -34,7 +34,7 @@ class Net(Classifier):
         train, val = (
             samples(part, self.windows, by_paper=self._by_paper) for part in (scenes, validation)
         )
-        self._net, self._said = fitted_net(self._kind, train, val, EPOCHS)
+        self._net, self._facts = fitted_net(self._kind, train, val, EPOCHS)
 
     def votes(self, x: SparseWindows) -> npt.NDArray[np.floating]:
         """See `Classifier`."""
@@ -42,7 +42,7 @@ class Net(Classifier):
 
     def cost(self) -> Cost:
         """Return multiply-adds of a window, and the size of float32 weights."""
-        return Cost(self._said["multiply_adds"], self._said["weights"] * WEIGHT_BYTES)
+        return Cost(self._facts["multiply_adds"], self._facts["weights"] * WEIGHT_BYTES)
 
 
 class Cnn(Net):

@@ -62,16 +62,16 @@ class OnnxModel(WindowDetector):
         self._gain = found["gain"]
 
     def _metadata(self) -> dict[str, float]:
-        said = self._session.get_modelmeta().custom_metadata_map
+        stated = self._session.get_modelmeta().custom_metadata_map
         found = {}
         for key, usual in DEFAULTS.items():
             try:
-                found[key] = type(usual)(said.get(key, usual))
+                found[key] = type(usual)(stated.get(key, usual))
             except ValueError:
                 text = f"must be a number, such as {usual}"
-                raise InputError(str(self._file), key, said[key], text) from None
+                raise InputError(str(self._file), key, stated[key], text) from None
             if found[key] <= 0:
-                raise InputError(str(self._file), key, said[key], "must be positive")
+                raise InputError(str(self._file), key, stated[key], "must be positive")
         return found
 
     def _windows_of(self, given: Any, found: dict[str, float]) -> Windows:

@@ -385,7 +385,7 @@ def _accuracies(
     """Yield, by order and share, how many trials trained, and the accuracy on each test trial."""
     assert asked.classifier is not None
     settings = training_campaigns(asked.campaigns)[0].settings
-    kept = Derived.of(asked.store, "learning")
+    saved = Derived.of(asked.store, "learning")
     samples = Derived.of(asked.store, SAMPLES)
     inputs = [samples.key(split) for split in SPLITS]
     how = None if asked.classifier == LOGISTIC else settings.model_dump(mode="json")
@@ -395,15 +395,15 @@ def _accuracies(
             place = 0 if share == 1.0 else order  # all of them are the same in any order
             name = f"{asked.classifier}-{place}-{round(100 * share)}"
             key = make_key("learning", learning.VERSION, inputs, [place, share, how])
-            if not kept.fresh(name, key):
+            if not saved.fresh(name, key):
                 count, part = learning.share_of(train, share, place)
                 accuracy = (
                     learning.logistic_accuracy(part, test)
                     if asked.classifier == LOGISTIC
                     else network_accuracy(settings, part, validation, test)
                 )
-                kept.write(name, key, {"trials": count, "accuracy": accuracy.tolist()})
-            made = kept.read(name)
+                saved.write(name, key, {"trials": count, "accuracy": accuracy.tolist()})
+            made = saved.read(name)
             bar.advance(1, name)
             yield (order, share), (made["trials"], made["accuracy"])
 

@@ -202,11 +202,11 @@ def _hours(number: float) -> str:
 
 def _impossible(it: ClaimPower, record: PowerRecord) -> str:
     """Return why a claim is out of reach, and how many repetitions would call it."""
-    said = f"it is open at the end in {_percent(it.never, 0)} of the drawn campaigns; "
+    stated = f"it is open at the end in {_percent(it.never, 0)} of the drawn campaigns; "
     if it.repetitions is None:
-        return f"{said}no number of repetitions is foreseen that calls it"
+        return f"{stated}no number of repetitions is foreseen that calls it"
     return (
-        f"{said}about {plural(it.repetitions, 'repetition')} of each condition in place of "
+        f"{stated}about {plural(it.repetitions, 'repetition')} of each condition in place of "
         f"{record.repetitions} would call it (an estimate: widths fall with the root of the number "
         "of trials)"
     )

@@ -90,14 +90,14 @@ def _file(path: Path) -> MessageSource:
 
 def _folder(path: Path) -> MessageSource:
     """Join the files of a recording, in the order that its metadata give."""
-    said = []
+    stated = []
     try:
         text = (path / METADATA).read_text()
         named = parse_yaml(text, path / METADATA)[_INFORMATION]["relative_file_paths"]
         files = [path / PurePath(one).name for one in named]
     except (InputError, OSError, ValueError, KeyError, TypeError):
         files = sorted((file for file in path.iterdir() if _ENDING.search(file.name)), key=_order)
-        said.append(f"has a damaged {METADATA}: its files are read in the order of their names")
+        stated.append(f"has a damaged {METADATA}: its files are read in the order of their names")
     there = [file for file in files if file.is_file() and not file.is_symlink()]
     if not there:
         raise FormatError(f"lacks its files, {', '.join(file.name for file in files) or 'none'}")
@@ -125,7 +125,7 @@ def _folder(path: Path) -> MessageSource:
         if file not in there
     ]
     ros1 = {topic for source in sources for topic in source.ros1}
-    warnings = (*said, *missing, *(line for source in sources for line in source.warnings))
+    warnings = (*stated, *missing, *(line for source in sources for line in source.warnings))
     return MessageSource(topics, read, ros1, warnings)
 
 

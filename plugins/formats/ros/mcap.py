@@ -156,10 +156,10 @@ def salvage_mcap(path: Path, name: str) -> ForeignTrial:
     )
     trial = recording(path, name, _source(path, found, part.at))
     lost = Lost(at_byte=part.at, unread_bytes=path.stat().st_size - part.at, reason=reason)
-    said = _messages_said(path, trial.about.get("frame_topic"))
-    if said is not None:
+    stated = _messages_said(path, trial.about.get("frame_topic"))
+    if stated is not None:
         there = frames[trial.about["frame_topic"]]
-        lost = lost.model_copy(update={"frames": max(said - there, 0)})
+        lost = lost.model_copy(update={"frames": max(stated - there, 0)})
     return replace(trial, lost=lost, packets=part.records)
 
 
@@ -203,12 +203,12 @@ class _Within:
 def _scan(path: Path) -> _Found:
     """Read all of a file once, and check it."""
     found = _Found()
-    kept = 0
+    retained = 0
     for kind, topic, data in _messages(path, found, {ros2.COLUMN}):
         if kind != ros2.COLUMN:
             continue
-        kept += len(data)
-        if kept > _MOST_KEPT:
+        retained += len(data)
+        if retained > _MOST_KEPT:
             raise FormatError(f"holds more than {_MOST_KEPT >> 30} GiB in {topic}")
         rows = ros2.RowsMessage.parse(data)
         found.columns.setdefault((rows.file, rows.column), []).append(rows)

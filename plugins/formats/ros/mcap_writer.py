@@ -99,9 +99,9 @@ class _Trial:
         self.counts = {"events": 0, "frames": 0, "messages": 0}
 
     def _label(self) -> TrialLabel | None:
-        kept = Derived.of(self.store, LABELS, self.campaign.name)
+        stored = Derived.of(self.store, LABELS, self.campaign.name)
         try:
-            return kept.load(self.recording.folder.name, TrialLabel)
+            return stored.load(self.recording.folder.name, TrialLabel)
         except FileNotFoundError:
             return None
 

@@ -83,10 +83,10 @@ class Original:
 
     def _check_column(self, file: str, name: str, values: Array) -> None:
         streams, known = self.record.streams, {**COLUMNS, **TRACKS, **TIMING}
-        for stream, said in streams.items():
-            for part, (_, kind) in STREAMS.get(said.kind, {}).items():
+        for stream, stated in streams.items():
+            for part, (_, kind) in STREAMS.get(stated.kind, {}).items():
                 known[f"{STREAM_GROUP}/{stream}/{part}"] = kind
-        files = {DATA, *(stream_file(name) for name, said in streams.items() if said.of_camera)}
+        files = {DATA, *(stream_file(name) for name, stated in streams.items() if stated.of_camera)}
         if name not in known or name.startswith("events/") or file not in files:
             raise FormatError(f"holds the column {name!r:.60} of {file!r:.60}, which no trial has")
         dtype, shape, _ = known[name]
@@ -160,18 +160,18 @@ class Original:
             writer.add_poses(PoseChunk(*_group(data, "poses", ("t", "host", "xyz", "rotvec"))))
         for frames in self._frames(FRAMES_KIND, data):
             writer.add_frames(frames)
-        for name, said in self.record.streams.items():
-            if said.of_camera:
+        for name, stated in self.record.streams.items():
+            if stated.of_camera:
                 self._fill_camera(writer, name)
             elif f"{STREAM_GROUP}/{name}/t" in data:
-                parts = STREAMS[said.kind]
+                parts = STREAMS[stated.kind]
                 values = _group(data, f"{STREAM_GROUP}/{name}", tuple(parts))
                 named: dict[str, Any] = {
                     field: found for (field, _), found in zip(parts.values(), values, strict=True)
                 }
-                if said.kind == ScalarChunk.KIND:
+                if stated.kind == ScalarChunk.KIND:
                     named["unit"] = self.units.get(name, "")
-                writer.add_stream(name, _CHUNKS[said.kind](**named))
+                writer.add_stream(name, _CHUNKS[stated.kind](**named))
 
     def _fill_camera(self, writer: TrialWriter, name: str) -> None:
         file = stream_file(name)
@@ -215,25 +215,25 @@ class Original:
         """Write the trial's label, before the trial: no one reads it until the trial exists."""
         if self.label is None:
             return
-        kept = Derived.of(store, LABELS, campaign)
-        make_folder(kept.folder)
+        saved = Derived.of(store, LABELS, campaign)
+        make_folder(saved.folder)
         if self.label_arrays is not None:
-            write_bytes(kept.arrays_path(trial), self.label_arrays)
-        write_json(kept.folder / f"{trial}.json", self.label.to_json())
+            write_bytes(saved.arrays_path(trial), self.label_arrays)
+        write_json(saved.folder / f"{trial}.json", self.label.to_json())
 
     def drop_label(self, store: Store, campaign: str, trial: str) -> None:
         """Delete the label of a trial that was not written."""
-        kept = Derived.of(store, LABELS, campaign)
-        (kept.folder / f"{trial}.json").unlink(missing_ok=True)
-        kept.arrays_path(trial).unlink(missing_ok=True)
+        saved = Derived.of(store, LABELS, campaign)
+        (saved.folder / f"{trial}.json").unlink(missing_ok=True)
+        saved.arrays_path(trial).unlink(missing_ok=True)
 
     def keep_sync(self, campaign: Campaign, recording: Recording) -> None:
         """Write the refitted clocks, as of the files that were made now."""
         if self.sync is None:
             return
         make_folder(campaign.sync_folder)
-        kept = self.sync.model_copy(update={"raw": recording.raw_checksum})
-        write_json(campaign.sync_file(recording.folder.name), kept.to_json())
+        saved = self.sync.model_copy(update={"raw": recording.raw_checksum})
+        write_json(campaign.sync_file(recording.folder.name), saved.to_json())
 
 
 def _group(data: Mapping[str, Array], group: str, parts: tuple[str, ...]) -> list[Array]:

@@ -295,12 +295,12 @@ class DetectorSearch:
         of two or so.
         """
         if run.setting not in self._seconds:
-            kept = [
+            retained = [
                 self.derived.read(other.name)["seconds"]
                 for other in self.runs
                 if other.setting == run.setting and self.sweep.done(other)
             ]
-            known = next((each for each in kept if each["train"] is not None), None)
+            known = next((each for each in retained if each["train"] is not None), None)
             self._seconds[run.setting] = (
                 self._probe(run) if known is None else (known["train"], known["count"])
             )

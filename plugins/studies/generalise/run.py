@@ -97,8 +97,8 @@ def measure_generalisation(
         tasks += [skin_task(work, model, SKIN_SEEDS + number, trials) for number in range(count)]
     sweep = task_sweep(tasks, work.results)
     made = sweep.run(begin=lambda number, count, task: console.say(f"{task.name} ..."))
-    kept = work.results.load().results if tasks else {}
-    results = {task.name: kept[task.name] for task in tasks}
+    stored = work.results.load().results if tasks else {}
+    results = {task.name: stored[task.name] for task in tasks}
     return Generalised(store.simulated, made, results, work.results.path)
 
 

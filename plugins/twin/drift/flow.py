@@ -145,8 +145,8 @@ def fit_drift(
     prior = OneSpecimen(rig, spread, seed, references.with_forces and rig.scene.force is not None)
     with_events = references.slides[first.id].camera is not None
     slides = Slides(item.plan, (first,), frozenset({first.id} if with_events else ()))
-    kept = Derived.of(store, "drift-worlds", item.name)
-    bank = prior.bank(simulated("reference (worlds)", prior, slides, worlds, kept))
+    saved = Derived.of(store, "drift-worlds", item.name)
+    bank = prior.bank(simulated("reference (worlds)", prior, slides, worlds, saved))
     observed = [
         of_names(statistics([slide], {slide.trial}, guess).fitted, bank.statistics)
         for slide in references.slides.values()

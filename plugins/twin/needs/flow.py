@@ -85,7 +85,7 @@ class _Judged:
         jobs = [
             replace(world, rig=changed(world.rig, one)) for one in settings for world in self.worlds
         ]
-        work = partial(_numbers, kept=frozenset(self.pilot.groups))
+        work = partial(_numbers, retained=frozenset(self.pilot.groups))
         found, count = everywhere("effects (worlds)", work, jobs), len(self.worlds)
         return [
             replace(self.having, values=np.concatenate(found[k : k + count]))
@@ -103,8 +103,8 @@ class _Judged:
         return [min(times) for times in zip(*rounds, strict=True)]
 
 
-def _numbers(world: DrawnWorld, kept: frozenset[str]) -> F64:
-    return marked([[marks(trial) for trial in world.take()]], kept).values
+def _numbers(world: DrawnWorld, retained: frozenset[str]) -> F64:
+    return marked([[marks(trial) for trial in world.take()]], retained).values
 
 
 def measure_needs(
@@ -215,11 +215,11 @@ def write_cheapest(twin: Path, needs: Needs) -> None:
         path.unlink(missing_ok=True)
         return
     left = "".join(f"#   {effect.title}\n" for effect in needs.effects if effect.left_out)
-    said = (
+    stated = (
         f"# Written by `sliplab calibrate scene`: {twin.name} without\n{left}"
         f"# A slide takes {it.time:.2f} of the twin's time, {it.seconds:.3g} s of one core; its\n"
         f"# score is worse by {it.loss:.2g} ({it.low:.2g} to {it.high:.2g}) times the twin's "
         "scatter (simulated).\n"
     )
     data = {"extends": twin.name, "name": path.stem.replace("_", "-"), "mock": needs.settings}
-    write_text(path, said + rig_yaml(data))
+    write_text(path, stated + rig_yaml(data))

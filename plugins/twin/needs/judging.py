@@ -133,14 +133,14 @@ class Marked:
     groups: tuple[str, ...]
 
 
-def marked(worlds: Sequence[Sequence[Marks]], kept: Collection[str]) -> Marked:
+def marked(worlds: Sequence[Sequence[Marks]], retained: Collection[str]) -> Marked:
     """Return the numbers of worlds that took the same trials.
 
     Args:
         worlds: `marks` of each trial. kept: groups.
     """
     first = worlds[0][0]
-    names = [name for name in first if name in kept]
+    names = [name for name in first if name in retained]
     groups = tuple(name for name in names for _ in first[name])
     values = [[np.concatenate([one[name] for name in names]) for one in row] for row in worlds]
     return Marked(np.array(values), groups)
@@ -211,8 +211,8 @@ def need(pilot: Marked, having: Marked, without: Marked) -> Need:
     of_group = np.array([[group == name for group in pilot.groups] for name in names], np.float64)
     of_group /= of_group.sum(axis=1, keepdims=True) * scale
 
-    def loss(truth: F64, kept: list[int]) -> F64:
-        more = crps(without.values[kept], truth) - crps(having.values[kept], truth)
+    def loss(truth: F64, retained: list[int]) -> F64:
+        more = crps(without.values[retained], truth) - crps(having.values[retained], truth)
         # a number that one of the trials has not, such as a marker's that was not seen
         result: F64 = np.nan_to_num(more) @ of_group.T
         return result
@@ -222,7 +222,12 @@ def need(pilot: Marked, having: Marked, without: Marked) -> Need:
     losses = found.sum(axis=1)
     others = [[k for k in every if k != own] for own in every]
     absent, present = (
-        np.array([loss(one, kept).sum(axis=1).mean() for one, kept in zip(of, others, strict=True)])
+        np.array(
+            [
+                loss(one, retained).sum(axis=1).mean()
+                for one, retained in zip(of, others, strict=True)
+            ]
+        )
         for of in (without.values, having.values)
     )
     return Need(

@@ -136,11 +136,11 @@ class DvxplorerServer:
                 raise FakeServerError(
                     f"the server did not report '{wanted}' within {timeout_s:g} s"
                 )
-            said, value = self._pipe.recv()
+            stated, value = self._pipe.recv()
         except (EOFError, OSError):
             raise FakeServerError(f"the server ended before it reported '{wanted}'") from None
-        if said != wanted:
-            raise FakeServerError(f"the server reported '{said}' instead of '{wanted}': {value}")
+        if stated != wanted:
+            raise FakeServerError(f"the server reported '{stated}' instead of '{wanted}': {value}")
         return value
 
 

@@ -36,7 +36,7 @@ class BoxLosses:
     """Pulses without a report, from gaps in their numbers."""
     exposures: int = 0
     """Exposures without a report, from gaps in their numbers."""
-    told_by_box: int = 0
+    reported_by_box: int = 0
     """Reports that the box dropped by its own count, its buffer being full; included above."""
     lines: int = 0
     """Garbled lines of any kind."""
@@ -44,7 +44,7 @@ class BoxLosses:
     """Reports dropped by the host because they were not read; see `MOST_WAITING`."""
 
     def __bool__(self) -> bool:
-        return any((self.pulses, self.exposures, self.told_by_box, self.lines, self.unread))
+        return any((self.pulses, self.exposures, self.reported_by_box, self.lines, self.unread))
 
 
 class ReportTrain:
@@ -335,7 +335,7 @@ class SerialSyncBox:
             return True
         numbers = [whole(word) for word in rest.split(" ")]
         if kind == "D":
-            (train.losses.told_by_box,) = numbers
+            (train.losses.reported_by_box,) = numbers
             return True
         if train.first_us is None:
             if len(self._early) < MOST_EARLY:

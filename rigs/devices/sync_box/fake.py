@@ -151,7 +151,7 @@ class FakeSyncBox:
         self._origin_ns = self._now_ns()
         self._lines = LineReader()
         self._armed: _Plan | None = None
-        self._first_us = self._sent = self._exposed = self._dropped = self._told = 0
+        self._first_us = self._sent = self._exposed = self._dropped = self._reported = 0
         self._stamps: list[int] = []
 
     def _us(self) -> int:
@@ -219,8 +219,8 @@ class FakeSyncBox:
         while self._stamps and self._stamps[0] <= now_us:
             self._report(f"X {self._exposed} {self._stamps.pop(0)}")
             self._exposed += 1
-        if self._dropped != self._told:
-            self._told = self._dropped
+        if self._dropped != self._reported:
+            self._reported = self._dropped
             self._say(f"D {self._dropped}")
 
     def _obey(self, body: str) -> None:
@@ -260,6 +260,6 @@ class FakeSyncBox:
             self._say("E code must be lfsr, irregular or regular")
         else:
             self._armed = _Plan(round(float(hz) * 1000), int(ticks), int(seed), CODES[code])
-            self._sent = self._exposed = self._dropped = self._told = self.pulses = 0
+            self._sent = self._exposed = self._dropped = self._reported = self.pulses = 0
             self._stamps = []
             self._say("OK ARM")

@@ -205,15 +205,15 @@ def configure(device: Any, settings: UvcSettings) -> Json:
     found: Json = {}
     for name, code, value, tolerance in wanted:
         taken, back = device.set(code, value), device.get(code)
-        said = getattr(settings, name, value)
+        stated = getattr(settings, name, value)
         if not taken and back < 0:  # OpenCV's answer for a missing control
             if name not in {"auto_exposure", "exposure_us"}:
-                raise ValueError(f"{name} = {said}: the camera has no such control")
+                raise ValueError(f"{name} = {stated}: the camera has no such control")
             found[name] = None
             continue
         found[name] = _in_words(name, back)
         if abs(back - value) > tolerance:
-            raise ValueError(f"{name} = {said}: the camera has {found[name]} after it was set")
+            raise ValueError(f"{name} = {stated}: the camera has {found[name]} after it was set")
     return found
 
 

@@ -251,7 +251,7 @@ def test_garbled_reports_are_missing_and_counted(wire: FakeSyncBox, box: SerialS
     box.stop()
     assert box.losses.lines == 40
     assert 0 < box.losses.pulses <= 40
-    assert box.losses.told_by_box == 0
+    assert box.losses.reported_by_box == 0
 
 
 def test_dropped_reports_are_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
@@ -260,7 +260,7 @@ def test_dropped_reports_are_counted(wire: FakeSyncBox, box: SerialSyncBox) -> N
     pulses_of(box, 20)
     box.stop()
     losses = box.losses
-    assert losses.told_by_box == 40
+    assert losses.reported_by_box == 40
     assert losses.exposures in range(19, 22)
     assert 0 < losses.pulses <= 21
     box.start(200.0, SEED)
@@ -436,7 +436,7 @@ def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
     pulses_of(box, 10)
     box.stop()
     losses = box.losses
-    assert (losses.pulses, losses.exposures, losses.told_by_box, losses.lines) == (0, 0, 0, 1)
+    assert (losses.pulses, losses.exposures, losses.reported_by_box, losses.lines) == (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize("us", ["999999999", "99999999999999", "99999999999999999999"])

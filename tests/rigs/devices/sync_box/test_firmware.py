@@ -237,7 +237,7 @@ def test_all_is_reported_at_the_highest_rate_with_exposures(run: Run, connect: C
     train(box, MOST_HZ, "lfsr", 1500)
     assert len(board.edges(1)) > 1400
     losses = box.losses
-    assert (losses.pulses, losses.exposures, losses.told_by_box) == (0, 0, 0)
+    assert (losses.pulses, losses.exposures, losses.reported_by_box) == (0, 0, 0)
 
 
 def test_a_flood_of_exposures_is_counted_and_moves_no_edge(run: Run, connect: Connect) -> None:
@@ -250,7 +250,7 @@ def test_a_flood_of_exposures_is_counted_and_moves_no_edge(run: Run, connect: Co
     assert np.array_equal(pulses, (sent - trigger[0]) * 1000 // MHZ), "no pulse is lost to it"
     losses = box.losses
     assert losses.pulses == 0
-    assert losses.told_by_box > 1000
+    assert losses.reported_by_box > 1000
     assert losses.exposures > 1000
 
 
