@@ -116,7 +116,7 @@ def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
     kept.keep(a_result("storage", "2026-01-02", d=1.0), names, folder, page)
     kept.keep(a_result("clocks", "2026-01-01", e=5.0), names, folder, page)
     text = page.read_text()
-    for row in ("| a_ms | 1.25 | 1 to 2 |", "| b_mb | 1,234 |  |", "| c_ms | - |  |"):
+    for row in ("| a_ms | 1.25 (1 to 2) |", "| b_mb | 1,234 |", "| c_ms | - |"):
         assert row in text
     titles = [line for line in text.splitlines() if line.startswith("## ")]
     assert titles == [f"## {name}" for name in names]
@@ -124,26 +124,37 @@ def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
     assert "**Run 2**: 2026-01-01, some, 2 cores" in text
     assert text.index("As run 2.") > text.index("## clocks")
     kept.keep(a_result("scene", "2026-01-03", a_ms=1.0), names, folder, page)
-    assert "| a_ms | 1 |  |" in page.read_text()
+    assert "| a_ms | 1 |" in page.read_text()
     assert "b_mb" not in page.read_text()
 
 
 def test_figures_of_kinds_form_a_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(kept.COLUMNS, "clocks", ("wrong", "late"))
     folder, page = tmp_path / "results", tmp_path / "RESULTS.md"
-    folder.mkdir()
-    (folder / kept.STUDIES).write_text("\n## Studies\n")
     result = a_result("clocks", "2026-01-01", trains=9.0, late_kink=0.5, kink_wrong=0.0, late_x=1.0)
     kept.keep(result, ("clocks",), folder, page)
-    assert page.read_text().splitlines()[-7:] == [
+    assert page.read_text().splitlines()[-5:] == [
         "| figure | value | wrong | late |",
         "| --- | ---: | ---: | ---: |",
         "| trains | 9 |  |  |",
         "| kink |  | 0 | 0.5 |",
         "| x |  |  | 1 |",
-        "",
-        "## Studies",
     ]
+
+
+def test_studies_between_comments_are_preserved(tmp_path: Path) -> None:
+    folder, page = tmp_path / "results", tmp_path / "RESULTS.md"
+    studies = f"{kept.BEGIN}\n\n## Studies\n\n{kept.END}\n"
+    page.write_text(f"# Old\n\n{studies}")
+    for day in ("2026-01-01", "2026-01-02"):
+        kept.keep(a_result("clocks", day, e=5.0), ("clocks",), folder, page)
+    text = page.read_text()
+    assert text.endswith(f"| e | 5 |\n\n{studies}")
+    assert text.count(kept.BEGIN) == 1
+    assert "# Old" not in text
+    page.write_text(f"{kept.BEGIN}\nno end\n")
+    kept.keep(a_result("clocks", "2026-01-03", e=5.0), ("clocks",), folder, page)
+    assert page.read_text().endswith(f"{kept.BEGIN}\nno end\n{kept.END}\n")
 
 
 def test_an_unknown_name_is_refused(
