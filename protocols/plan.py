@@ -424,7 +424,9 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
 def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level, ...]]:
     factors, levels = protocol.collection.all_factors, _levels(protocol)
     for text in enable:
-        name, _, raw = text.partition("=")
+        name, equals, raw = text.partition("=")
+        if not equals and name in factors:
+            raise InputError("--enable", "", text, f"must be factor=level, such as {name}=LEVEL")
         if name not in factors:
             raise InputError("--enable", "", text, unknown_factor(name or text, factors))
         factor = factors[name]

@@ -438,7 +438,10 @@ def safe_name(name: str) -> str:
         StoreError: it could lead out of its folder.
     """
     if not _SAFE.fullmatch(name) or ".." in name:
-        raise StoreError(f"'{name}' cannot be the name of a folder in a store")
+        raise StoreError(
+            f"'{name}' cannot be the name of a folder in a store: letters, digits and . _ - = , + "
+            "are possible"
+        )
     return name
 
 

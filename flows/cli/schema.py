@@ -30,7 +30,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a protocol, a rig file, an adapter or a document in a store."""
     from sliplab.flows.planning.schema import file_schema, kinds
-    from sliplab.storage.files import write_json
+    from sliplab.storage.files import make_folder, write_json
 
     if kind not in kinds():
         raise InputError("KIND", "", kind, one_of(kind, kinds()))
@@ -38,5 +38,6 @@ def schema(
     if out is None:
         console.print_json(made)
         return
+    make_folder(out.parent)
     write_json(out, made)
     finish({"kind": kind, "file": str(out)}, f"schema {kind}", as_json)

@@ -6,6 +6,7 @@ import keyword
 import re
 import sys
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
@@ -120,6 +121,9 @@ def name_fault(name: str) -> str:
         return "is a name that Python or SlipLab uses; choose another one"
     if name in listed():
         return f"is already the name of a driver of {listed()[name].package}; choose another one"
+    found = find_spec(name)
+    if found is not None and found.origin is not None:  # no mere folder
+        return "is the name of an installed package; choose another one"
     return ""
 
 

@@ -119,6 +119,8 @@ class Remote:
             ) from None
         except ValueError as error:
             raise InputError("URL", "", self.url, f"cannot be used: {error}") from None
+        except OSError as error:
+            raise RemoteError(f"{self.url}: cannot be reached: {error}") from None
         self._root = str(root).rstrip("/")
         kinds = self._fs.protocol
         self._local = "file" in ((kinds,) if isinstance(kinds, str) else kinds)

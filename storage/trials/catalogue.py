@@ -125,6 +125,7 @@ _ALLOWED = (
 _METHODS = frozenset(
     {"str", "startswith", "endswith", "contains", "isin", "isna", "notna", "isnull", "notnull"}
 )
+_ASSIGNS = re.compile(r"(?<![=<>!])=(?!=)")
 _REPEATS = frozenset("*+{")
 """In a pattern; nested ones may take for ever."""
 
@@ -137,7 +138,8 @@ def _expression_fault(expression: str) -> str | None:
         try:
             tree = ast.parse(re.sub("`[^`]*`", "name", expression.strip()), mode="eval")
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            return f"cannot be read ({error})"
+            hint = "; == compares" if _ASSIGNS.search(expression) else ""
+            return f"cannot be read ({error}){hint}"
         if all(map(_may_stand, ast.walk(tree))):
             return None
     return (

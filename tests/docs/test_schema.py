@@ -226,6 +226,9 @@ def test_the_command_prints_and_writes_it(
 
     out = tmp_path / "rig.json"
     assert not app(["schema", "rig", "--out", str(out)], standalone_mode=False)
+    deeper = tmp_path / "new" / "rig.json"
+    assert not app(["schema", "rig", "--out", str(deeper)], standalone_mode=False)
+    assert deeper.read_bytes() == out.read_bytes()
     assert json.loads(out.read_text()) == file_schema("rig")
     capsys.readouterr()
     assert not app(["schema", "protocol"], standalone_mode=False)

@@ -130,6 +130,7 @@ def test_options_take_finite_numbers_alone(command: str, value: str) -> None:
     ("given", "message"),
     [
         ("dept=2.4", "--enable = dept=2.4: unknown factor dept; defined factors: depth, speed, "),
+        ("depth", "--enable = depth: must be factor=level, such as depth=LEVEL"),
         ("", "--enable = '': unknown factor ; defined factors: depth, speed, direction"),
         (f"direction={MINUS}90", f"= {MINUS}90: holds U+2212 MINUS SIGN: write '-90'"),
         ("depth=2,4", "= 2,4: has a decimal comma: write '2.4'"),

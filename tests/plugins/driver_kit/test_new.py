@@ -74,6 +74,7 @@ def test_nothing_of_the_example_is_left_and_every_module_compiles(kind: str) -> 
         ("json", "is a name that Python or SlipLab uses"),
         ("class", "is a name that Python or SlipLab uses"),
         ("ur", "is already the name of a driver of sliplab"),
+        ("numpy", "is the name of an installed package"),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_in_a_line(name: str, why: str, tmp_path: Path) -> None:

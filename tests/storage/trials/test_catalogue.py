@@ -175,6 +175,11 @@ def test_expressions_that_are_no_query_are_refused(expression: str, tmp_path: Pa
         query(catalogue(Store.open(tmp_path / "s")), expression)
 
 
+def test_one_equals_sign_gets_a_hint() -> None:
+    with pytest.raises(ValueError, match=r"cannot be read .*; == compares"):
+        query(pd.DataFrame({"events": [1]}), "events = 3")
+
+
 ENDLESS = f"""events == 9**9**9; events < 2 ** (2 ** 40); events == 1 << 10**12
 trial == 'a' * 10**10; events in [1] * 10**9; events == (1, 2) * 10**9
 events == {"1 + " * 1000}1; trial.str.contains('(a+)+$'); trial.str.repeat(10**9) == 'a'
