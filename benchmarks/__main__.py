@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from importlib import import_module
 from typing import Any
 
+from benchmarks.kept import PAGE, Result, as_line, keep, table
 from benchmarks.measure import SEED, Figures, machine, versions
-from benchmarks.retained import PAGE, Result, as_line, keep, table
 
 NAMES = (
     "storage",

@@ -38,7 +38,7 @@ class ExportRequest:
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """What was written: a title and pairs for people, and JSON for programs."""
 
     title: str
@@ -55,7 +55,7 @@ class Export:
     """
 
     of: Literal["store", "trials", "model"]
-    write: Callable[[ExportRequest], Exported]
+    write: Callable[[ExportRequest], ExportResult]
     options: frozenset[str] = frozenset()
 
 
@@ -135,7 +135,7 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     return opened, holders[0], [part]
 
 
-def _labels(request: ExportRequest) -> Exported:
+def _labels(request: ExportRequest) -> ExportResult:
     """Write the labels of trials as a table."""
     from sliplab.storage.formats.export_trials import label_table
     from sliplab.storage.trials.catalogue import check_table_path, write_table
@@ -148,12 +148,12 @@ def _labels(request: ExportRequest) -> Exported:
             f"{opened.folder}: {request.part} has no labels; run: sliplab label {opened.folder}"
         )
     write_table(table, request.output)
-    return Exported(
+    return ExportResult(
         f"labels of {request.part}", {"labels": len(table), "output": str(request.output)}
     )
 
 
-def _trials(request: ExportRequest) -> Exported:
+def _trials(request: ExportRequest) -> ExportResult:
     """Write trials in a format of other programs."""
     from sliplab.storage.formats.export_trials import export_trials
     from sliplab.storage.trials.registration import copy_registrations
@@ -178,4 +178,4 @@ def _trials(request: ExportRequest) -> Exported:
         )
     copy_registrations(campaign, request.output / REGISTRATIONS / campaign.name)
     pairs = {key: value for key, value in result.items() if key != "files"}
-    return Exported(f"exported to {request.output}", result, pairs)
+    return ExportResult(f"exported to {request.output}", result, pairs)

@@ -93,7 +93,7 @@ class CollectionSession:
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 
-class Listener(Protocol):
+class SessionListener(Protocol):
     """Follows a session, such as a progress display."""
 
     def on_trial_done(self, trial: Trial, outcome: str) -> None:
@@ -115,7 +115,7 @@ class NoListener:
 
 @contextmanager
 def open_session(
-    run_request: RunRequest, listener: Listener | None = None
+    run_request: RunRequest, listener: SessionListener | None = None
 ) -> Iterator[CollectionSession]:
     """Open a session for a collection; the rig is closed when the block ends.
 

@@ -9,14 +9,14 @@ import typer
 
 from sliplab.flows.cli.common import CampaignOption, JsonOption
 from sliplab.flows.cli.export import former
-from sliplab.flows.exports import Export, Exported, ExportRequest
+from sliplab.flows.exports import Export, ExportRequest, ExportResult
 from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
-    from sliplab.plugins.deploy.run import Exported as Figures
+    pass
 
 WINDOWS = 256
 """The ONNX file is checked on so many."""
@@ -43,7 +43,7 @@ def export_model(
     former("export-model", ExportRequest(str(model), "", form, out, options), as_json)
 
 
-def write(request: ExportRequest) -> Exported:
+def write(request: ExportRequest) -> ExportResult:
     """Write a network's resource use on a Speck chip and its model card, and ONNX unless `card`."""
     from sliplab.flows.detecting.request import load_model
     from sliplab.storage.remote.mirror import open_store
@@ -72,14 +72,14 @@ def write(request: ExportRequest) -> Exported:
     for warning in (*result["warnings"], *result["problems"]):
         console.say(f"warning: {warning}")
     simulated = " (simulated data)" if result["simulated"] else ""
-    return Exported(f"exported to {out}{simulated}", result, _model_pairs(result))
+    return ExportResult(f"exported to {out}{simulated}", result, _model_pairs(result))
 
 
 CARD = Export("model", write, frozenset({"store", "campaign"}))
 ONNX = Export("model", write, CARD.options | {"windows"})
 
 
-def _model_pairs(result: Figures) -> dict[str, object]:
+def _model_pairs(result: ExportedModel) -> dict[str, object]:
     change, accuracy = result["change"], result["accuracy"]
     checked = result["onnx_windows_equal"]
     return {

@@ -10,7 +10,7 @@ import typer
 
 from sliplab.flows.cli.common import CampaignOption, JsonOption, PlaceArgument
 from sliplab.flows.cli.export import former
-from sliplab.flows.exports import Export, Exported, ExportRequest
+from sliplab.flows.exports import Export, ExportRequest, ExportResult
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, one_of
@@ -40,7 +40,7 @@ def publish(
     former("publish", ExportRequest(store, "", form, output, options), as_json)
 
 
-def write(request: ExportRequest) -> Exported:
+def write(request: ExportRequest) -> ExportResult:
     """Write committed trials as a data set in one folder, with a data card and checksums."""
     from sliplab.plugins.publish.forms import publish as publish_as
     from sliplab.plugins.publish.publication import Publication, PublicationInfo
@@ -66,7 +66,7 @@ def write(request: ExportRequest) -> Exported:
             publication, request.output, request.form, lambda name: bar.advance(1, name)
         )
     mark = " (simulated data)" if publication.simulated else ""
-    return Exported(f"published in {request.output}{mark}", result)
+    return ExportResult(f"published in {request.output}{mark}", result)
 
 
 EXPORT = Export("store", write, frozenset({"campaign", "title", "creator", "licence"}))

@@ -55,7 +55,7 @@ _NEVER: Counting = _no_slip
 
 
 @dataclass(frozen=True)
-class Case:
+class ReflexCase:
     """One trial with a detector and a reflex, or without; a point of the sweep."""
 
     trial: Trial
@@ -85,7 +85,7 @@ class Request:
     rig: RigFile
     plan: Plan
     requests: Mapping[str, DetectRequest]
-    cases: Sequence[Case]
+    cases: Sequence[ReflexCase]
     out: Path
 
 
@@ -133,13 +133,13 @@ def request(
     made = hash_data([VERSION, rig_hash(text), plan.protocol.model_dump(mode="json")])
     cases = []
     for trial in trials:
-        cases.append(Case(trial, None, None, hash_data([made, trial.id])))
+        cases.append(ReflexCase(trial, None, None, hash_data([made, trial.id])))
         for name, asked in requests.items():
             rule = _numbers(asked.detection)
             for reflex in reflexes:
                 make_reflex(reflex, file, plan, trial, HOLD_S)  # raises before anything moves
                 key = hash_data([made, trial.id, asked.model_sha256, rule, reflex])
-                cases.append(Case(trial, name, reflex, key))
+                cases.append(ReflexCase(trial, name, reflex, key))
     return Request(next(iter(requests.values())).rig, plan, requests, cases, out)
 
 
@@ -230,7 +230,7 @@ class Seen:
 
 def measure(
     asked: Request,
-    case: Case,
+    case: ReflexCase,
     networks: Mapping[str, Counting],
     build: Callable[[RigFile], Rig] = build_rig,
 ) -> ReflexTrial:

@@ -71,7 +71,7 @@ def test_what_was_done_is_kept_and_not_done_again(
     measured: list[str] = []
     measure = flow.measure
 
-    def counting(asked: flow.Request, case: flow.Case, *rest: object) -> object:
+    def counting(asked: flow.Request, case: flow.ReflexCase, *rest: object) -> object:
         if measured and measured[-1] == "stop":
             measured.append("go")
             raise KeyboardInterrupt
