@@ -16,7 +16,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
-    pass
+    from sliplab.plugins.deploy.run import Exported as ExportedModel
 
 WINDOWS = 256
 """The ONNX file is checked on so many."""
