@@ -25,7 +25,7 @@ from sliplab.analysis.metrics.intervals import (
 )
 from sliplab.analysis.report.figures.intervals import differences
 from sliplab.analysis.report.outcomes import is_lost, lost_ms
-from sliplab.analysis.report.page import Number, PageFigure, Table, render_page
+from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.evaluation import SeedTimes, Share
@@ -396,7 +396,7 @@ def render(compared: ReportComparison, here: Path, there: Path) -> str:
         if rows:
             label = f"difference, here less there ({axis})"
             svg = differences(rows, label, simulated=simulated or other)
-            figures.append((title, PageFigure(svg)))
+            figures.append((title, Figure(svg)))
     made = [[row.what, _short(row.here), _short(row.there)] for row in compared.settings]
     one = "The one here is" if simulated else "The one there is"
     return render_page(

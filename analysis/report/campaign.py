@@ -14,7 +14,7 @@ from scipy.stats import theilslopes
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
-from sliplab.analysis.report.page import Content, PageFigure, Table, number
+from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.protocols import Trial
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.summary import (
@@ -50,10 +50,10 @@ class CollectedSection(Content):
     template: ClassVar[str] = "collected.html"
     quality: QualitySummary
     source: str
-    grids: Sequence[tuple[str, str, str, PageFigure]]
+    grids: Sequence[tuple[str, str, str, Figure]]
     table: Table
 
-    def all_figures(self) -> list[PageFigure]:
+    def all_figures(self) -> list[Figure]:
         """Return the grids."""
         return [figure for *_, figure in self.grids]
 
@@ -117,7 +117,7 @@ def source_words(summary: Summary | OneCameraSummary) -> str:
     return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
 
 
-def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, PageFigure] | None:
+def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
     """Draw the trials by the first two factors; None if there are fewer."""
     names = list(item.planned.levels)[:2]
     if len(names) < 2:
@@ -148,7 +148,7 @@ def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, PageFigure] 
     svg = figures.collected_grid(
         shown[0], shown[1], counts, planned, axes[0], axes[1], simulated=simulated
     )
-    return item.name, names[0], names[1], PageFigure(svg, name=f"collected-{item.name}", data=data)
+    return item.name, names[0], names[1], Figure(svg, name=f"collected-{item.name}", data=data)
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,11 @@ class QualitySection(Content):
     stream: str
     """The stream whose rate is drawn."""
     wear: Sequence[tuple[str, str, DriftTrend]]
-    over: Sequence[tuple[str, PageFigure]]
-    references: Sequence[tuple[str, PageFigure]]
+    over: Sequence[tuple[str, Figure]]
+    references: Sequence[tuple[str, Figure]]
     tables: Sequence[Table]
 
-    def all_figures(self) -> list[PageFigure]:
+    def all_figures(self) -> list[Figure]:
         """Return the figures of all campaigns."""
         return [figure for _, figure in (*self.over, *self.references)]
 
@@ -195,7 +195,7 @@ def quality_section(
     )
 
 
-def _over_campaign(item: Collected, stream: str, simulated: bool) -> PageFigure:
+def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
     numbers = [trial.index + 1 for trial, _ in item.trials]
     records = [recording.record for _, recording in item.trials]
     rates = [getattr(record.counts, stream) / record.recorded_s for record in records]
@@ -215,7 +215,7 @@ def _over_campaign(item: Collected, stream: str, simulated: bool) -> PageFigure:
         "tightest gate (share of its limit)": shares,
         "failed attempts": [again.get(place, 0) for place in numbers],
     }
-    return PageFigure(svg, name=f"quality-{item.name}", data=data)
+    return Figure(svg, name=f"quality-{item.name}", data=data)
 
 
 def _nearest(gates: Mapping[str, Gate]) -> tuple[float, str]:
@@ -360,7 +360,7 @@ def _measured(rows: Sequence[ReferenceTrial]) -> list[str]:
     return [name for name in WEAR if events or name != "hold_events_per_s"]
 
 
-def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> PageFigure:
+def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> Figure:
     places = [row.place for row in rows]
     measured = _measured(rows)
     panels = {WEAR[key][1]: [getattr(row, key) for row in rows] for key in measured}
@@ -371,4 +371,4 @@ def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> P
         "motion to first slip (ms)": [row.first_slip_ms for row in rows],
     }
     svg = figures.references(places, panels, simulated=simulated)
-    return PageFigure(svg, name=f"references-{name}", data=data)
+    return Figure(svg, name=f"references-{name}", data=data)

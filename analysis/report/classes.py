@@ -19,8 +19,8 @@ from sliplab.analysis.report.figures import classes as figures
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.page import (
     Content,
+    Figure,
     Number,
-    PageFigure,
     Table,
     percent,
     render_page,
@@ -234,7 +234,7 @@ class ClassNetworkSection(Content):
     strong: bool
     warnings: Sequence[str]
     methods: Table
-    training: PageFigure
+    training: Figure
     each_seed: Table
     argmax: str
     strict: str
@@ -294,9 +294,9 @@ class ConfusionSection(Content):
     """
 
     template: ClassVar[str] = "class_confusion.html"
-    confusion: PageFigure
+    confusion: Figure
     pairs: Table
-    recall: PageFigure
+    recall: Figure
     left_out: int
     classes: Table
 
@@ -319,7 +319,7 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
     strict = scores.accuracy.strict
     line = None if strict is None else (strict, "all test windows")
     return ConfusionSection(
-        PageFigure(
+        Figure(
             figures.confusion_map(matrix, scores.classes, simulated=simulated),
             name="confusion",
             data={
@@ -337,7 +337,7 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
                 for n, i, j in pairs
             ],
         ),
-        PageFigure(
+        Figure(
             intervals.shares(
                 {"the worst first": rows}, "recall (%)", simulated=simulated, line=line
             ),
@@ -365,7 +365,7 @@ class LengthSection(Content):
     """Accuracy where only the beginning of each window is seen."""
 
     template: ClassVar[str] = "class_length.html"
-    figure: PageFigure
+    figure: Figure
     early: str
 
 
@@ -383,7 +383,7 @@ def _length_section(summary: ClassSummary) -> LengthSection | None:
         "windows": [row.n for row in rows],
     }
     svg = figures.accuracy_by_length(rows, chance, simulated=summary.simulated)
-    return LengthSection(PageFigure(svg, name="accuracy-by-length", data=data), _early_words(rows))
+    return LengthSection(Figure(svg, name="accuracy-by-length", data=data), _early_words(rows))
 
 
 def _early_words(rows: Sequence[LengthShare]) -> str:
@@ -400,7 +400,7 @@ class ErrorSection(Content):
     """Accuracy by condition, and recordings that were not classified rightly."""
 
     template: ClassVar[str] = "class_where.html"
-    factors: PageFigure | None
+    factors: Figure | None
     wrong: Table
     all_wrong: int
     recordings: int

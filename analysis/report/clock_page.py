@@ -27,7 +27,7 @@ from sliplab.analysis.report.figures.clocks import (
     over_trials,
     residuals,
 )
-from sliplab.analysis.report.page import Number, PageFigure, Table, number, render_page
+from sliplab.analysis.report.page import Figure, Number, Table, number, render_page
 from sliplab.storage.schema.trial import Gate, TrialRecord
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import QuarantineEntry
@@ -108,13 +108,13 @@ class _Shown:
         there = [(float(number), known) for number, known in found if known is not None]
         return self.titles[device], [number for number, _ in there], [known for _, known in there]
 
-    def draw(self, panels: Sequence[OverTrials]) -> PageFigure | None:
+    def draw(self, panels: Sequence[OverTrials]) -> Figure | None:
         """Draw panels over the trials; None without a panel."""
         firsts, number = {}, 1
         for name, trials in self.campaigns.items():
             firsts[name] = float(number)
             number += len(trials)
-        return PageFigure(over_trials(panels, firsts, simulated=self.simulated)) if panels else None
+        return Figure(over_trials(panels, firsts, simulated=self.simulated)) if panels else None
 
 
 def _headline(shown: _Shown) -> list[Number]:
@@ -128,7 +128,7 @@ def _headline(shown: _Shown) -> list[Number]:
     return found
 
 
-def _residuals(shown: _Shown) -> PageFigure | None:
+def _residuals(shown: _Shown) -> Figure | None:
     """Draw residuals of every device that has some."""
     panels = []
     for device, name in shown.titles.items():
@@ -147,7 +147,7 @@ def _residuals(shown: _Shown) -> PageFigure | None:
         )
         of_worst = (worst.residuals[f"{device}_s"], worst.residuals[f"{device}_us"])
         panels.append(Residuals(device, name, time_s, residual_us, *of_worst, worst.name))
-    return PageFigure(residuals(panels, simulated=shown.simulated)) if panels else None
+    return Figure(residuals(panels, simulated=shown.simulated)) if panels else None
 
 
 def _drift(shown: _Shown) -> list[OverTrials]:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.clocks import uncertainty_by_trial
-from sliplab.analysis.report.page import Content, PageFigure, number
+from sliplab.analysis.report.page import Content, Figure, number
 from sliplab.protocols.timing import WIRED
 from sliplab.storage.schema.summary import LabelSummary, Sync
 from sliplab.storage.schema.trial import DEVICES
@@ -100,7 +100,7 @@ class ClockSection(Content):
 
     template: ClassVar[str] = "clocks.html"
     sync: Sync
-    figure: PageFigure | None
+    figure: Figure | None
     page: str | None
 
 
@@ -118,7 +118,7 @@ def clock_section(
     return ClockSection(sync, figure, PAGE if page else None)
 
 
-def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> PageFigure:
+def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> Figure:
     """Draw the uncertainty of each device in each trial."""
     starts: dict[str, int] = {}
     names: list[str] = []
@@ -139,4 +139,4 @@ def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> Page
             drawn[title] = ([k for k, _ in there], [value for _, value in there])
     data = {f"{device}, uncertainty (µs)": values for device, values in found.items()}
     svg = uncertainty_by_trial(drawn, starts, simulated=simulated)
-    return PageFigure(svg, name="clocks", data={"trial": names, **data})
+    return Figure(svg, name="clocks", data={"trial": names, **data})

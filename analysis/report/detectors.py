@@ -9,7 +9,7 @@ from typing import ClassVar
 import pandas as pd
 
 from sliplab.analysis.report.figures.detectors import latency_over_rate
-from sliplab.analysis.report.page import Content, PageFigure, Table, number, percent
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.evaluation import (
     DetectorComparison,
@@ -65,7 +65,7 @@ class DetectorSection(Content):
     trials: PartTrials
     smoothing: int
     best: Best | None
-    figure: PageFigure
+    figure: Figure
     tables: Sequence[Table]
 
 
@@ -103,7 +103,7 @@ def detector_section(
         compared.trials,
         entries[0][1].rates[0].choice,
         _best(entries),
-        PageFigure(
+        Figure(
             latency_over_rate(panels, simulated=simulated),
             name="detectors",
             data={str(name): column for name, column in points.to_dict("list").items()},

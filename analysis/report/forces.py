@@ -10,7 +10,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.force import has_forces, moving_mean, plate_forces
 from sliplab.analysis.labels.label_errors import force_compared, spread
 from sliplab.analysis.report.figures.forces import force_overview
-from sliplab.analysis.report.page import Content, PageFigure, Table, number
+from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
@@ -42,7 +42,7 @@ class ForceSection(Content):
     friction: float
     uncertainty_ms: float
     trials: int
-    figure: PageFigure
+    figure: Figure
     figures: Table
     rules: Table
 
@@ -95,7 +95,7 @@ def force_section(
         friction,
         forces.uncertainty_ns / 1e6,
         len(there),
-        PageFigure(svg, name="forces", data=data),
+        Figure(svg, name="forces", data=data),
         _figures(there),
         _rules(store, campaigns),
     )

@@ -10,7 +10,7 @@ from typing import ClassVar
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.campaign import source_words
 from sliplab.analysis.report.figures.trials import label_uncertainty
-from sliplab.analysis.report.page import Content, PageFigure, Table, number
+from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.storage.schema.evaluation import ChangePointCoverage, LabelCheck, RuleErrors
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
 from sliplab.storage.schema.summary import HoldSummary, OneCameraSummary, Summary
@@ -42,7 +42,7 @@ class LabelSection(Content):
     ruling: str
     papillae: ChangePointCoverage | None
     check: LabelCheck | None
-    figure: PageFigure
+    figure: Figure
     truth: bool
     rules: Table
     holds: Table
@@ -144,7 +144,7 @@ def _figure(
     labels: Sequence[tuple[TrialLabel, int]],
     errors: Mapping[str, Mapping[str, Sequence[float]]],
     simulated: bool,
-) -> PageFigure:
+) -> Figure:
     """Draw distances from the truth where it is known, and the change points' own intervals."""
     widths: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for label, centre in labels:
@@ -163,9 +163,7 @@ def _figure(
         f"change point, {kind}: width of the 95 % interval (ms)": values
         for kind, values in widths.items()
     }
-    return PageFigure(
-        label_uncertainty(errors, widths, simulated=simulated), name="labels", data=data
-    )
+    return Figure(label_uncertainty(errors, widths, simulated=simulated), name="labels", data=data)
 
 
 def _holds(holds: Mapping[str, HoldSummary]) -> Table:

@@ -13,7 +13,7 @@ from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.intervals import Panel, by_condition
 from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
 from sliplab.analysis.report.outcomes import LEAST, OUTCOMES, TIMES, WORDS, Conditions, times
-from sliplab.analysis.report.page import Content, PageFigure, Table, number, percent, with_interval
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.summary import (
@@ -90,7 +90,7 @@ class LatencySection(Content):
     trends: Mapping[str, Sequence[FactorTrend]]
     latency_note: str
     clock_note: str
-    figures: Sequence[PageFigure]
+    figures: Sequence[Figure]
     statistics: Table
     accounts: Table
     levels: Sequence[Table]
@@ -197,7 +197,7 @@ def choice_note(chosen_by: str) -> str:
 
 def _figures(
     experiment: str, found: Conditions, by: Sequence[str], simulated: bool
-) -> list[PageFigure]:
+) -> list[Figure]:
     """Draw the experiment's times by condition."""
     value = {name: known.value for name, known in PAPER.items()}
     if experiment == "kinematic":
@@ -230,7 +230,7 @@ def _draw(
     lines: Mapping[str, tuple[float | None, str]],
     name: str,
     simulated: bool,
-) -> PageFigure:
+) -> Figure:
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]
@@ -246,7 +246,7 @@ def _draw(
         "trial": [trial.trial for _, trial in trials],
         **{AXES[time][0]: [getattr(trial, time) for _, trial in trials] for time in shown},
     }
-    return PageFigure(svg, name=name, data=data)
+    return Figure(svg, name=name, data=data)
 
 
 def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:

@@ -16,7 +16,7 @@ from sliplab.analysis.networks.marker_net import MarkerNet
 from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.outcomes import failure_section
-from sliplab.analysis.report.page import Content, PageFigure, Table, percent
+from sliplab.analysis.report.page import Content, Figure, Table, percent
 from sliplab.analysis.report.summary import judged_part, plain_rules
 from sliplab.analysis.report.windows import (
     METHODS,
@@ -96,8 +96,8 @@ class MarkerNetworkSection(Content):
     alarms: str
     seeds: Seeds
     rules: Sequence[str]
-    confusion: PageFigure
-    training: PageFigure
+    confusion: Figure
+    training: Figure
     methods: Table
     classes: Table
 

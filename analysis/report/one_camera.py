@@ -25,8 +25,8 @@ from sliplab.analysis.report.marker_network import (
 )
 from sliplab.analysis.report.page import (
     Content,
+    Figure,
     Number,
-    PageFigure,
     Table,
     number,
     render_page,
@@ -238,7 +238,7 @@ class RateSection(Content):
     """Event rates in the hold and over the motion."""
 
     template: ClassVar[str] = "rates.html"
-    figure: PageFigure
+    figure: Figure
     rates: Table
 
 
@@ -329,7 +329,7 @@ def _rates(
         for name, rate in rates.items()
     ]
     return RateSection(
-        PageFigure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
+        Figure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
         Table(("campaign", "trials", "in the hold (events/s)", "in the motion (events/s)"), rows),
     )
 

@@ -31,7 +31,7 @@ from sliplab.storage.files import make_folder, safe_name, write_text
 
 
 @dataclass(frozen=True)
-class PageFigure:
+class Figure:
     """A picture (SVG text) and its data; a template has its caption.
 
     Attributes:
@@ -92,12 +92,12 @@ class Content:
     template: ClassVar[str | Path]
     """The section's file in `templates/sections` by name, or a plug-in's file."""
 
-    def all_figures(self) -> Iterable[PageFigure]:
+    def all_figures(self) -> Iterable[Figure]:
         """Every figure among the values."""
         for item in fields(self):
             value = getattr(self, item.name)
             values = value if isinstance(value, list | tuple) else [value]
-            yield from (found for found in values if isinstance(found, PageFigure))
+            yield from (found for found in values if isinstance(found, Figure))
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Rendered(Content):
 
     title: str
     html: Markup
-    figures: Sequence[PageFigure]
+    figures: Sequence[Figure]
 
 
 @cache

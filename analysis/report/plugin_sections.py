@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.page import Content, PageFigure, Rendered, csv_text, render_section
+from sliplab.analysis.report.page import Content, Figure, Rendered, csv_text, render_section
 from sliplab.protocols.hashing import hash_data
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
@@ -121,7 +121,7 @@ def _rendered(name: str, section: ReportSection, data: ReportData) -> Rendered |
     return Rendered(str(title), html, figures)
 
 
-def _check(figures: Sequence[PageFigure], section: str, simulated: bool) -> None:
+def _check(figures: Sequence[Figure], section: str, simulated: bool) -> None:
     """Check that the names of figures do not clash with those of other sections."""
     names = [safe_name(figure.name) for figure in figures]
     for name in names:

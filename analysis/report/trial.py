@@ -16,7 +16,7 @@ from sliplab.analysis.report.campaign import tracks_words
 from sliplab.analysis.report.figures import trials as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.latency import choice_note
-from sliplab.analysis.report.page import Content, PageFigure
+from sliplab.analysis.report.page import Content, Figure
 from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
@@ -102,7 +102,7 @@ class TrialSection(Content):
     markers: bool
     """Their displacements are drawn."""
     paper: str
-    figure: PageFigure
+    figure: Figure
     fault: str = ""
 
 
@@ -136,7 +136,7 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
         tracks_words(simulated) if recording.frame_source == "tracks" else "",
         len(frame_ns) > 0,
         PAPER["event_rate"].text,
-        PageFigure(svg, name="trial", data=_data(frame_s, displacement_px, event_s, cell)),
+        Figure(svg, name="trial", data=_data(frame_s, displacement_px, event_s, cell)),
         "" if recording.record.lost is None else recording.record.lost.reason,
     )
 
@@ -194,7 +194,7 @@ class OutputSection(Content):
     condition: str
     settings: Detection
     choice: str
-    figure: PageFigure
+    figure: Figure
 
 
 def output_section(
@@ -222,5 +222,5 @@ def output_section(
         for kind, numbers in (("raw", spikes), ("smoothed", found.smoothed))
         for k, word in enumerate(CLASS_WORDS)
     }
-    figure = PageFigure(svg, name="outputs", data={"end of the window (s)": end_s.tolist(), **data})
+    figure = Figure(svg, name="outputs", data={"end of the window (s)": end_s.tolist(), **data})
     return OutputSection(example.condition, settings, choice_note(settings.choose), figure)

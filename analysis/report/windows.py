@@ -16,7 +16,7 @@ from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.figures import windows as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
-from sliplab.analysis.report.page import Content, PageFigure, Table, number, percent
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.published import PAPER, Published
 from sliplab.protocols.quantity import level_order
 from sliplab.storage.schema.classes import JudgedClasses
@@ -72,8 +72,8 @@ class NetworkSection(Content):
     """Stronger methods were trained."""
     warnings: Sequence[str]
     paper: Mapping[str, Published]
-    confusion: PageFigure
-    training: PageFigure
+    confusion: Figure
+    training: Figure
     methods: Table
     classes: Table
 
@@ -111,14 +111,14 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
     )
 
 
-def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> PageFigure:
+def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> Figure:
     """Draw the confusion matrix."""
     confusion = np.asarray(kinematic.confusion)
     called = {
         f"called {word} (windows)": confusion[:, k].tolist()
         for k, word in enumerate((*CLASS_WORDS, "undecided"))
     }
-    return PageFigure(
+    return Figure(
         figures.confusion(confusion, simulated=simulated),
         name="confusion",
         data={"true class": list(CLASS_WORDS), **called},
@@ -127,13 +127,13 @@ def confusion_figure(kinematic: Kinematic, *, simulated: bool) -> PageFigure:
 
 def training_figure(
     history: Sequence[dict[str, Any]], chosen_epoch: int, *, simulated: bool
-) -> PageFigure:
+) -> Figure:
     """Draw loss and accuracy over the epochs.
 
     Args:
         history: a row for each epoch, by the names in `_HEADINGS`.
     """
-    return PageFigure(
+    return Figure(
         figures.training_curves(history, chosen_epoch, simulated=simulated),
         name="training",
         data={heading: [row[name] for row in history] for name, heading in _HEADINGS.items()},
@@ -160,8 +160,8 @@ class WhereSection(Content):
     """
 
     template: ClassVar[str] = "where.html"
-    tenths: PageFigure
-    factors: PageFigure | None
+    tenths: Figure
+    factors: Figure | None
     levels: Table
     still: Table
     worst: Table
@@ -206,7 +206,7 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
         dtype=object,
     )
     return WhereSection(
-        PageFigure(
+        Figure(
             figures.recall_by_tenth(kinematic.by_tenth, simulated=simulated),
             name="recall-by-tenth",
             data={str(name): column for name, column in tenths.to_dict("list").items()},
@@ -226,7 +226,7 @@ def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
 
 def factor_figure(
     by_factor: Mapping[str, Mapping[str, Share]], accuracy: Accuracy, *, simulated: bool
-) -> PageFigure:
+) -> Figure:
     """Draw accuracy by each factor's levels, next to that of all windows."""
     strict = accuracy.strict
     groups = {
@@ -238,7 +238,7 @@ def factor_figure(
     }
     line = None if strict is None else (strict, "all test windows")
     named = [replace(it, name=f"{factor} {it.name}") for factor, of in groups.items() for it in of]
-    return PageFigure(
+    return Figure(
         intervals.shares(
             groups, "windows classified correctly (%)", simulated=simulated, line=line
         ),
@@ -270,7 +270,7 @@ class LeadSection(Content):
 
     template: ClassVar[str] = "lead.html"
     calibration: ProbabilityCalibration
-    figure: PageFigure
+    figure: Figure
 
 
 def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None:
@@ -288,7 +288,7 @@ def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None
     rows = kinematic.reliability
     data = {heading: [getattr(row, key) for row in rows] for key, heading in headings.items()}
     svg = figures.reliability(rows, simulated=simulated)
-    return LeadSection(kinematic.calibration, PageFigure(svg, name="lead-reliability", data=data))
+    return LeadSection(kinematic.calibration, Figure(svg, name="lead-reliability", data=data))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from benchmarks.guesses.document import SensitivityResults
 from benchmarks.guesses.plot import ChangePanel, FigureChange, lowered_and_raised
 from benchmarks.guesses.results import FIGURES, UNITS, changes, figure_cells, figures
 from benchmarks.scene_parameters import AS_IT_IS, NAMES
-from sliplab.analysis.report.page import PageFigure, Table, number, percent
+from sliplab.analysis.report.page import Figure, Table, number, percent
 from sliplab.analysis.study import Finding, Study
 from sliplab.flows.cli.common import CampaignOption, StoreArgument, opened_campaigns
 
@@ -99,7 +99,7 @@ def view(found: SensitivityResults) -> dict[str, Any]:
     return {
         "percent_changed": share,
         "trials": len(base.trials),
-        "figures": PageFigure(svg, name="guesses", data=_data(list(names), lower, higher)),
+        "figures": Figure(svg, name="guesses", data=_data(list(names), lower, higher)),
         "settings": Table(
             ("guess", *(f"{text} ({UNITS[key]})" for key, text in FIGURES.items())), [first, *rows]
         ),

@@ -11,7 +11,7 @@ from benchmarks.scene_tradeoff.plot import cost_against_error
 from benchmarks.scene_tradeoff.variants import table_rows
 from benchmarks.scene_tradeoff.windows import PHASES
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.report.page import PageFigure, Table, number, percent, render_page
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
 
 _HERE = Path(__file__).parent
 FAMILIES = {
@@ -69,7 +69,7 @@ class SceneCost:
     """
 
     trials: Sequence[str]
-    figure: PageFigure
+    figure: Figure
     table: Table
 
 
@@ -131,7 +131,7 @@ def scene_cost(result: Result) -> SceneCost:
         if row["step_ms"] is None
     }
     svg = cost_against_error(series, ERRORS, lines, "wall time of a trial (ms)", simulated=True)
-    return SceneCost(result["trials"], PageFigure(svg), Table(COLUMNS, tradeoff_rows(result)))
+    return SceneCost(result["trials"], Figure(svg), Table(COLUMNS, tradeoff_rows(result)))
 
 
 def _drawn(family: str, error: Error) -> Error:

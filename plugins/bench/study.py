@@ -90,13 +90,13 @@ def shown(found: BenchResult, plot: Path) -> Iterator[Table | str]:
 
 def view(found: BenchResult, plot: Path) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
 
     detectors, costs = (Table(head, rows) for head, *rows in _tables(found))
     return {
         "note": _interval_note(found),
         "detectors": detectors,
-        "latencies": PageFigure(plot.read_text("utf-8")),
+        "latencies": Figure(plot.read_text("utf-8")),
         "costs": costs,
     }
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.page import Content, PageFigure, Table
+from sliplab.analysis.report.page import Content, Figure, Table
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.plugins.claims import plot as figures
 from sliplab.plugins.claims.document import Look, StoppingRecord
@@ -57,7 +57,7 @@ class Claimed:
     target: str
     chosen: bool
     table: Table
-    figure: PageFigure
+    figure: Figure
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ClaimsSection(Content):
     template: ClassVar[Path] = Path(__file__).with_name("section.html")
     campaigns: Sequence[Claimed]
 
-    def all_figures(self) -> list[PageFigure]:
+    def all_figures(self) -> list[Figure]:
         """Return the figures of all campaigns."""
         return [each.figure for each in self.campaigns]
 
@@ -121,7 +121,7 @@ def _row(looks: Sequence[Look], k: int) -> list[str]:
     ]
 
 
-def _figure(name: str, looks: Sequence[Look], simulated: bool) -> PageFigure:
+def _figure(name: str, looks: Sequence[Look], simulated: bool) -> Figure:
     claims = range(len(looks[0].claims))
     data: dict[str, Sequence[object]] = {"trials": [look.taken for look in looks]}
     for k in claims:
@@ -129,7 +129,7 @@ def _figure(name: str, looks: Sequence[Look], simulated: bool) -> PageFigure:
         title = f"{k + 1}: {states[0].claim}"
         for end in ("estimate", "low", "high"):
             data[f"{title}, {end} ({states[0].unit})"] = [getattr(each, end) for each in states]
-    return PageFigure(figures.looks(looks, simulated=simulated), name=f"claims-{name}", data=data)
+    return Figure(figures.looks(looks, simulated=simulated), name=f"claims-{name}", data=data)
 
 
 SECTION = ReportSection(claims_section, claims_key)

@@ -89,7 +89,7 @@ def shown(study: ReflexStudy) -> Iterator[Table]:
 
 def view(study: ReflexStudy) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
     from sliplab.plugins.reflex import plot
 
     simulated, rows, trials = study.simulated, study.rows, list(study.trials.values())
@@ -97,12 +97,12 @@ def view(study: ReflexStudy) -> dict[str, object]:
     courses = _example(study)
     return {
         "count": len({it.trial for it in trials}),
-        "outcomes": PageFigure(plot.outcomes(rows, trials, simulated=simulated)),
+        "outcomes": Figure(plot.outcomes(rows, trials, simulated=simulated)),
         "table_of_outcomes": Table(COLUMNS, [_cells(row) for row in rows]),
-        "fallen": PageFigure(plot.fallen(rows, trials, simulated=simulated)),
-        "reactions": PageFigure(plot.reactions(rows, simulated=simulated)) if reacting else None,
+        "fallen": Figure(plot.fallen(rows, trials, simulated=simulated)),
+        "reactions": Figure(plot.reactions(rows, simulated=simulated)) if reacting else None,
         "table_of_reactions": Table(REACTION, [_reaction_cells(row) for row in reacting]),
-        "courses": PageFigure(plot.courses(courses, simulated=simulated)),
+        "courses": Figure(plot.courses(courses, simulated=simulated)),
         "example": courses[0].trial,
     }
 

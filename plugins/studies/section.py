@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from sliplab.analysis.report.page import Content, PageFigure, Table, number
+from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.analysis.report.programs import CommandResult
 from sliplab.plugins.studies.plot import AxisPair, DetectorPoint, cost_and_error
@@ -31,7 +31,7 @@ class TradeoffSection(Content):
 
     template: ClassVar[Path] = Path(__file__).with_name("section.html")
     command: str
-    search: PageFigure | None = None
+    search: Figure | None = None
     found: Table | None = None
     most: int = 0
     front: int = 0
@@ -90,7 +90,7 @@ def _scaled(row: Json, key: tuple[str, str]) -> float | None:
     return FIGURES[key][1] * float(np.mean(values))
 
 
-def _draw_search(rows: Sequence[Json], *, simulated: bool) -> PageFigure:
+def _draw_search(rows: Sequence[Json], *, simulated: bool) -> Figure:
     cost = ("work", "us_per_s")
     panels = [
         AxisPair(cost[1], key[1], FIGURES[cost][0], f"{FIGURES[key][0]}, test trials")
@@ -108,7 +108,7 @@ def _draw_search(rows: Sequence[Json], *, simulated: bool) -> PageFigure:
         "on the front": [row["front"] for row in rows],
     }
     svg = cost_and_error(points, panels, simulated=simulated)
-    return PageFigure(svg, name="tradeoff-detector", data=data)
+    return Figure(svg, name="tradeoff-detector", data=data)
 
 
 def _search_table(rows: Sequence[Json]) -> tuple[Table, int]:

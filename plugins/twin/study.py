@@ -108,7 +108,7 @@ def shown(fit: TwinFit, out: Path, trials: SameTrials) -> Iterator[Table | str]:
 
 def view(fit: TwinFit, out: Path, trials: SameTrials) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
     from sliplab.plugins.twin import plot
 
     simulated = fit.simulated
@@ -122,7 +122,7 @@ def view(fit: TwinFit, out: Path, trials: SameTrials) -> dict[str, object]:
                 for it in fit.misfits
             ],
         ),
-        "intervals": PageFigure(plot.intervals(fit.parameters, simulated=simulated)),
+        "intervals": Figure(plot.intervals(fit.parameters, simulated=simulated)),
         "parameters": Table(
             ("parameter", "key", "assumed", "fitted", "95 % interval", "identified"),
             [
@@ -146,8 +146,7 @@ def view(fit: TwinFit, out: Path, trials: SameTrials) -> dict[str, object]:
             ],
         ),
         "figures": [
-            (PageFigure(svg), caption)
-            for svg, caption in plot.of_trials(trials, simulated=simulated)
+            (Figure(svg), caption) for svg, caption in plot.of_trials(trials, simulated=simulated)
         ],
         "needs": Table(
             ("effect", "verdict", "loss", "90 % interval", "chance", "shown by", "time"),

@@ -216,7 +216,7 @@ def test_keys_are_explained() -> None:
     models = file_schema("protocol")["definitions"]
     reported = models["Training"]["properties"]["patience"]["description"]
     assert reported.startswith("Epochs without a better validation accuracy")
-    assert models["Range"]["properties"].keys() == {"from", "to", "step"}
+    assert models["LevelRange"]["properties"].keys() == {"from", "to", "step"}
 
 
 def test_the_command_prints_and_writes_it(

@@ -78,7 +78,7 @@ def shown(record: StressRecord) -> Iterator[Table | str]:
 def view(record: StressRecord) -> dict[str, object]:
     """Return what the page shows."""
     from sliplab.analysis.metrics.alarm_rates import few_words
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
     from sliplab.plugins.bench.stress import plot
 
     simulated, names = record.simulated, record.nuisances
@@ -88,13 +88,13 @@ def view(record: StressRecord) -> dict[str, object]:
     best = record.detectors[0]
     return {
         "detectors": Table(COLUMNS, [cells(name, it.under(ALL)) for name, it in titled]),
-        "clean": PageFigure(plot.clean_trials(titled, names, simulated=simulated)),
+        "clean": Figure(plot.clean_trials(titled, names, simulated=simulated)),
         "best": titled[0][0],
         "few": few_words(min(best.under(name).trials for name in names)),
         "by_nuisance": Table(
             ("nuisance", *COLUMNS[1:]), [cells(name, best.under(name)) for name in names]
         ),
-        "accuracy": PageFigure(plot.by_strength(rows, names, simulated=simulated)),
+        "accuracy": Figure(plot.by_strength(rows, names, simulated=simulated)),
         "accuracies": Table(("nuisance", *rows), _accuracies(record, names, list(rows))),
     }
 

@@ -129,7 +129,7 @@ def shown(record: PowerRecord) -> Iterator[Table | str]:
 
 def view(record: PowerRecord) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
     from sliplab.plugins.claims.power import plot
 
     simulated, curve = record.simulated, record.learning
@@ -137,9 +137,9 @@ def view(record: PowerRecord) -> dict[str, object]:
     return {
         "texts": list(_texts(record)),
         "claims": Table(COLUMNS, _rows(record)),
-        "decisions": PageFigure(plot.decisions(calls, record.planned, simulated=simulated)),
-        "widths": PageFigure(plot.widths(record.claims, simulated=simulated)),
-        "learning": curve and PageFigure(plot.learning_curve(curve, simulated=simulated)),
+        "decisions": Figure(plot.decisions(calls, record.planned, simulated=simulated)),
+        "widths": Figure(plot.widths(record.claims, simulated=simulated)),
+        "learning": curve and Figure(plot.learning_curve(curve, simulated=simulated)),
     }
 
 

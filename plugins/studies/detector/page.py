@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.report.page import PageFigure, Table, number, percent, render_page
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
 from sliplab.plugins.studies.detector.rows import (
     FACTORS,
     LOOSE,
@@ -111,13 +111,13 @@ def _front(rows: Sequence[DetectorRow], *, leads: bool) -> Table:
     return Table(columns, table)
 
 
-def _points(rows: Sequence[DetectorRow], simulated: bool) -> PageFigure:
+def _points(rows: Sequence[DetectorRow], simulated: bool) -> Figure:
     def values(row: DetectorRow) -> dict[str, float | None]:
         found = {name: row.objective(name) for name in OBJECTIVES}
         return {k: None if v is None else DRAWN.get(k, 1.0) * v for k, v in found.items()}
 
     points = [DetectorPoint(values(row), row.front, row.paper) for row in rows]
-    return PageFigure(front_panels(points, PANELS, simulated=simulated))
+    return Figure(front_panels(points, PANELS, simulated=simulated))
 
 
 Comparisons = Sequence[tuple[DetectorRow, Mapping[str, Any]]]
@@ -129,7 +129,7 @@ def _level(item: Mapping[str, Any]) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def _lines(comparisons: Comparisons, simulated: bool) -> PageFigure:
+def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
     bars: dict[str, list[FactorBar]] = {}
     for row, item in comparisons:
         ranges = {
@@ -139,7 +139,7 @@ def _lines(comparisons: Comparisons, simulated: bool) -> PageFigure:
         bar = FactorBar(_level(item), item["paper"], ranges)
         bars.setdefault(FACTORS[item["factor"]], []).append(bar)
     figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
-    return PageFigure(factor_lines(bars, figures, simulated=simulated))
+    return Figure(factor_lines(bars, figures, simulated=simulated))
 
 
 def _factors(comparisons: Comparisons) -> Table:

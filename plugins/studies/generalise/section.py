@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from sliplab.analysis.report.figures.intervals import ShareInterval, shares
-from sliplab.analysis.report.page import Content, PageFigure, Table, percent
+from sliplab.analysis.report.page import Content, Figure, Table, percent
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.analysis.report.programs import CommandResult
 from sliplab.analysis.report.seeds import seed_words
@@ -24,7 +24,7 @@ class SkinSection(Content):
 
     template: ClassVar[Path] = Path(__file__).with_name("section.html")
     command: str
-    figure: PageFigure | None = None
+    figure: Figure | None = None
     table: Table | None = None
     seeds: str = ""
 
@@ -61,7 +61,7 @@ def skin_section(
         drawn = [item for of in groups.values() for item in of]
         line = None if strict is None else (strict, "this network, its own skin")
         svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
-        figure = PageFigure(svg, name="skins", data=share_data(drawn))
+        figure = Figure(svg, name="skins", data=share_data(drawn))
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     return SkinSection(command, figure, Table(columns, rows), seeds)
 

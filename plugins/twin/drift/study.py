@@ -84,7 +84,7 @@ def shown(fit: DriftFit) -> Iterator[Table | str]:
 
 def view(fit: DriftFit) -> dict[str, object]:
     """Return what the page shows."""
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
     from sliplab.plugins.twin.plot import ParameterTrend, trends
 
     panels = [
@@ -99,7 +99,7 @@ def view(fit: DriftFit) -> dict[str, object]:
     return {
         "condition": ", ".join(f"{name} {value}" for name, value in fit.condition.items()),
         "count": len(fit.parameters[0].references),
-        "figure_of_all": PageFigure(trends(panels, simulated=fit.simulated)) if panels else None,
+        "figure_of_all": Figure(trends(panels, simulated=fit.simulated)) if panels else None,
         "table_of_all": Table(HEADER, [_row(it) for it in fit.identified]),
         "others": [it.title for it in fit.parameters if not it.identified],
     }

@@ -66,7 +66,7 @@ def shown(found: TwinGap) -> Iterator[Table]:
 def view(found: TwinGap) -> dict[str, object]:
     """Return what the page shows."""
     from sliplab.analysis.report.figures.intervals import ShareInterval, shares
-    from sliplab.analysis.report.page import PageFigure, Table
+    from sliplab.analysis.report.page import Figure, Table
 
     strict = [(it.title, it.windows.strict) for it in found.networks]
     rows = {
@@ -76,7 +76,7 @@ def view(found: TwinGap) -> dict[str, object]:
     table = [_cells(it) for it in found.networks]
     return {
         "campaigns": " and ".join(found.campaigns),
-        "accuracy": PageFigure(shares(rows, label, simulated=found.simulated)),
+        "accuracy": Figure(shares(rows, label, simulated=found.simulated)),
         "networks": Table(COLUMNS[:LATENCIES], [row[:LATENCIES] for row in table]),
         "latencies": Table(
             ("trained on", *COLUMNS[LATENCIES:]), [[row[0], *row[LATENCIES:]] for row in table]

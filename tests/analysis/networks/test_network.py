@@ -184,8 +184,8 @@ def test_the_chip_vendors_package_is_never_imported() -> None:
         "import sliplab.analysis.detectors.live, sliplab.plugins.deploy.onnx_file\n"
         "import sliplab.analysis.networks.quantised, sliplab.analysis.networks.training\n"
         "from sliplab.analysis.networks.network import build\n"
-        "from sliplab.protocols.settings import Network, Windows\n"
-        "build(Network(), Windows(), 0)\n"
+        "from sliplab.protocols.settings import NetworkSettings, Windows\n"
+        "build(NetworkSettings(), Windows(), 0)\n"
         "bad = [m for m in sys.modules if m.split('.')[0] == 'samna' or 'dynapcnn' in m]\n"
         "assert not bad, bad\n"
     )

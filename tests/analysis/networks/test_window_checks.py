@@ -51,7 +51,7 @@ def test_shuffled_labels_are_at_chance_and_true_ones_are_not() -> None:
 
 
 def test_labels_that_were_not_really_shuffled_are_found_out() -> None:
-    with pytest.raises(CheckFailed, match="something beside the training labels"):
+    with pytest.raises(CheckFailed, match="something other than the training labels"):
         check_chance(chance(deal=lambda labels, seed: labels))
 
 

@@ -122,7 +122,7 @@ def test_grades_stand_wherever_an_uncertainty_does(page: str) -> None:
 def test_quarantine_is_told_in_words(page: str) -> None:
     assert "arm (digital input): uncertain by 4200.0 µs, 1000 µs are allowed" in page
     assert "frames has no clock: ambiguous: the train fits twice" in page
-    assert "goes on for 0.75 s beyond the pulses" in page
+    assert "continues for 0.75 s beyond the pulses" in page
     assert ">r=4</td>" not in page  # lost frames are no matter of clocks
 
 

@@ -18,7 +18,7 @@ from sliplab.analysis.report.figures.intervals import (
     differences,
 )
 from sliplab.analysis.report.outcomes import FailureSection
-from sliplab.analysis.report.page import Content, PageFigure, Table, csv_text, render_page
+from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
 from sliplab.analysis.report.trial import TrialSection
 from sliplab.plugins.studies.generalise.section import SkinSection
 from sliplab.plugins.studies.plot import AxisPair as Pair
@@ -116,7 +116,7 @@ def test_a_figures_data_are_columns_with_units() -> None:
 
 
 def test_a_page_escapes_everything_but_its_figures() -> None:
-    figure = PageFigure(SVG, "name", {})
+    figure = Figure(SVG, "name", {})
     commands = Table((EVIL, "command"), [[EVIL, f"sliplab view {EVIL}"]], commands=(1,))
     sections = (
         TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, EVIL, figure),
@@ -132,9 +132,9 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     assert "Paper, on its own robot:" in page
     assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
-    torn = render(TrialSection("a", {}, "", False, "", PageFigure(SVG), "is cut short"))
+    torn = render(TrialSection("a", {}, "", False, "", Figure(SVG), "is cut short"))
     assert "It is not whole: it was salvaged from a file that is cut short." in torn
-    plain = render(TrialSection("a", {}, "", False, "", PageFigure(SVG)))
+    plain = render(TrialSection("a", {}, "", False, "", Figure(SVG)))
     assert "not whole" not in plain
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]

@@ -107,7 +107,7 @@ def test_a_stopped_run_resumes_with_the_next_detector(
 
     monkeypatch.setattr(run, "prepare", prepared)
     found = run.run_bench(["always", "rate", "never"], "small", 1, tmp_path)
-    assert trained == ["Rate", "Never"]
+    assert trained == ["EventRate", "Never"]
     assert {row.name for row in found.detectors} == {"always", "rate", "never"}
 
 

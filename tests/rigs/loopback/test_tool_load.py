@@ -18,7 +18,7 @@ from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap
-from tests.rigs.mock.test_force import QUIET, go_to, slide_by
+from tests.rigs.mock.test_force import QUIET, go_to, move
 
 OFFSET_S = 400.0
 CONTROLLER = ClockMap.line(0, round(OFFSET_S * 1e9), 0)
@@ -32,7 +32,7 @@ def pressed() -> tuple[Any, ToolLoad]:
     load = ToolLoad(devices.world, devices.force, CONTROLLER, 50.0)
     go_to(devices, 2.4)
     devices.force.start()
-    slide_by(devices, 2.0)
+    move(devices, 2.0, 2.4, 2.0)
     load.follow()
     return devices, load
 

@@ -25,7 +25,7 @@ def test_rows_between_reach_over_both_ends() -> None:
         times, rows = history.between(first, last)
         assert times.tolist() == expected
         assert rows[:, 0].tolist() == expected
-    with pytest.raises(IndexError, match="before the kept history"):
+    with pytest.raises(IndexError, match="before the stored history"):
         history.between(-1, 3)
     with pytest.raises(IndexError):
         GrowingTable(2).between(0, 1)

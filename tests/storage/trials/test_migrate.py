@@ -9,7 +9,7 @@ import pytest
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import migrate as module
 from sliplab.storage.trials.checksums import write_sums
-from sliplab.storage.trials.migrate import STEPS, kept, migrate
+from sliplab.storage.trials.migrate import STEPS, migrate, retained
 from sliplab.storage.trials.store import FORMAT, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import campaign, commit
@@ -46,7 +46,7 @@ def test_it_migrates_forward_with_a_copy_kept(store: Store) -> None:
     assert migrate(store) == list(range(1, FORMAT))
     assert store.format == FORMAT
     assert verify(store) == []
-    copies = files(kept(store, 1))
+    copies = files(retained(store, 1))
     assert copies == {name: before[name] for name in copies}
     names = ("campaign.json", "protocol.yaml", "rig.yaml")
     assert copies.keys() == {"store.json", *(f"campaigns/c/{name}" for name in names)}
@@ -80,7 +80,7 @@ def test_an_interrupted_migration_is_begun_again(
     assert verify(store) == []
     assert migrate(store) == [1]
     assert verify(store) == []
-    assert all(data == before[name] for name, data in files(kept(store, 1)).items())
+    assert all(data == before[name] for name, data in files(retained(store, 1)).items())
 
 
 def test_formats_follow_each_other(store: Store) -> None:
