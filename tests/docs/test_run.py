@@ -49,9 +49,12 @@ ELSEWHERE = (
     "lab-pickles",
     "--help",
     "--stamp",
+    "--as croissant",
+    "--as onnx",
+    "--as labels",
 )
 """Needs a rig in real time, other machines, a running campaign or claims, a time-stamping
-authority, or stands for a word."""
+authority, labels or a network, writes what is there already, or stands for a word."""
 
 ADAPTER = """adapter: 1
 name: touches
