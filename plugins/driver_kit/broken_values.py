@@ -865,7 +865,7 @@ GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     "OpensToClose": (
         takes(ExampleGripper, "move", lambda self, mm, *rest: (80.0 - mm, *rest)),
         (MOVE, "move of the fingers"),
-        "asked for",
+        "requested",
     ),
     "GripperSpeedIgnored": (
         takes(ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)),
@@ -883,7 +883,7 @@ GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
         "the fingers were at",
     ),
     "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
-    "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it said"),
+    "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it reported"),
     "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
     "StopWaitsForAnswer": (
         StopWaitsForAnswer,
