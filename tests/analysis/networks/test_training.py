@@ -24,7 +24,14 @@ from sliplab.analysis.networks.network import (
     spike_counts,
     weights,
 )
-from sliplab.analysis.networks.training import Fitted, fit, learning_rate, predict_counts, restore
+from sliplab.analysis.networks.training import (
+    EpochRecord,
+    Fitted,
+    fit,
+    learning_rate,
+    predict_counts,
+    restore,
+)
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import NetworkSettings, Training, Windows
 
@@ -202,6 +209,16 @@ def test_a_damaged_state_is_refused(spoilt: bytes | None) -> None:
         fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, state=spoilt)
 
 
+def test_an_epoch_is_chosen_by_strict_accuracy_then_argmax_then_loss() -> None:
+    def record(strict: float, argmax: float, loss: float) -> EpochRecord:
+        return EpochRecord(1, 0.0, 0.0, loss, argmax, strict, 0.0, {})
+
+    silent = record(0.0, 1 / 3, 1.0986)
+    worse = [silent, record(0.8, 0.9, 0.1), record(0.9, 0.91, 0.1), record(0.9, 0.92, 0.3)]
+    best = record(0.9, 0.92, 0.2)
+    assert all(best.merit > other.merit for other in worse)
+
+
 def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) -> None:
     """Edges stand on the right of every training window; here they stand on the left."""
     x, y = TEST[0][..., ::-1], TEST[1]
@@ -211,6 +228,7 @@ def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) ->
         for net in (fitted, mirrored)
     )
     assert both > plain + 0.1
+    assert run(mirror=True, epochs=10, patience=10).history == mirrored.history
 
 
 def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
