@@ -167,6 +167,28 @@ def test_a_link_out_of_the_store_is_refused(store: Store, tmp_path: Path, name: 
     Store.open(store.folder)
 
 
+def test_a_quarantine_that_leads_out_is_refused(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "store")
+    folder = commit(where, "t")
+    (tmp_path / "outside").mkdir()
+    (where.folder / "quarantine").rmdir()
+    os.symlink(tmp_path / "outside", where.folder / "quarantine")
+    with pytest.raises(StoreError, match="points out of the store"):
+        where.quarantine(folder, "gate")
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_names_of_trials_and_campaigns_cannot_lead_out_of_the_store(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    for name in ("../x", "a/b", "", ".hidden", "a\0b", "x" * 300):
+        with pytest.raises(StoreError, match="cannot be the name"):
+            where.begin(name, None, 100)
+    store = Store.open(tmp_path / "s")
+    for name in ("..", "../x", "/etc", "a/../../b", "a\\..\\b/", "", ".", "é"):
+        with pytest.raises(StoreError, match="cannot be the name"):
+            store.campaign(name)
+
+
 def test_derived_results_that_lead_out_are_refused(store: Store, tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "derived").mkdir()
