@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
@@ -16,7 +16,9 @@ from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import import_foreign
 from sliplab.protocols.shown import one_of
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.store import Campaign, Store
+
+if TYPE_CHECKING:
+    from sliplab.storage.trials.store import Campaign, Store
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,7 +14,9 @@ from sliplab.flows.exports import Export, ExportRequest, ExportResult
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, one_of
-from sliplab.storage.trials.store import Campaign, Store
+
+if TYPE_CHECKING:
+    from sliplab.storage.trials.store import Campaign, Store
 
 app = typer.Typer()
 

@@ -41,6 +41,16 @@ def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
     assert "sliplab.plugins.bench.run" not in loaded("bench", "--help")
 
 
+def test_help_of_all_plug_ins_loads_no_arrays() -> None:
+    code = (
+        "import sys; sys.argv = ['sliplab', '--help']\n"
+        "from sliplab.flows.__main__ import main\n"
+        "try: main()\n"
+        "except SystemExit: print({'numpy', 'h5py', 'pandas', 'torch'} & set(sys.modules))"
+    )
+    assert said_by(code).splitlines()[-1] == "set()"
+
+
 def test_claims_load_what_they_need_when_trials_are_taken(tmp_path: Path) -> None:
     claims = tmp_path / "claims.yaml"
     stopping = "  stopping: {claims: [{figure: first_slip, at_most: 10 s}]}\n"
