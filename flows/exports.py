@@ -105,15 +105,16 @@ def check_export(request: ExportRequest) -> Export:
     for name in request.options:
         if name not in form.options:
             holders = [each for each in export_names() if name in known_export(each).options]
-            text = f"does not belong to --as {request.form}, but to {' and '.join(holders)}"
+            text = f"does not belong to --as {request.form}; it is of {', '.join(holders)}"
             raise InputError(f"--{name}", "", None, text)
+    place, whose = Path(request.place), f"--as {request.form} is of {TITLES[form.of]}"
+    if place.exists() and place.is_dir() == (form.of == "model"):
+        there = "a folder" if place.is_dir() else "a file"
+        raise InputError("WHAT", "", request.place, f"is {there}, and {whose}")
     if form.of == "trials" and not request.part:
-        raise InputError(
-            "PART", "", None, f"is needed: --as {request.form} is of {TITLES[form.of]}"
-        )
+        raise InputError("PART", "", None, f"is needed: {whose}")
     if form.of != "trials" and request.part:
-        text = f"is too much: --as {request.form} is of {TITLES[form.of]}"
-        raise InputError("PART", "", request.part, text)
+        raise InputError("PART", "", request.part, f"is too much: {whose}")
     return form
 
 

@@ -84,7 +84,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[SweepTa
         if name not in there:
             known = ", ".join(NAMES)
             raise InputError(
-                "GUESS",
+                "--guess",
                 "",
                 name,
                 f"must be a non-zero parameter of the scene, such as {known}",

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.command import run_command
 from benchmarks.scene_tradeoff.page import choice_pairs, short_table
 from benchmarks.scene_tradeoff.run import PAGE, tradeoff_scene
 from sliplab.flows.cli.common import DaskOption, JsonOption, ProtocolArgument
@@ -39,4 +40,6 @@ def main(
     console.show(f"Page (simulated): {(out / PAGE).resolve()}")
 
 
-typer.run(main)
+app = typer.Typer()
+app.command()(main)
+run_command(app)

@@ -81,7 +81,8 @@ def export(
     if form is None and part:
         form = "labels" if old_labels else old_form or "aedat4"
         console.say(
-            f"without --as is an old form; write: sliplab export {place} {part} --as {form}"
+            f"without --as is an old form; write: sliplab export {place} {part} --as {form} "
+            f"--output {output}"
         )
     if form is None:
         raise InputError("--as", "", None, "is needed: " + one_of("", export_names()))

@@ -52,7 +52,8 @@ def test_former_options_give_the_same_files_and_name_the_new_ones(
         (("--as", "dsec"), "PART: is needed: --as dsec is of a campaign or a trial"),
         (("small", "--as", "mcap"), "PART = small: is too much: --as mcap is of a store"),
         (("small", "--as", "dsec", "--licence", "MIT"), "--licence: does not belong to --as"),
-        (("--as", "mcap", "--windows", "3"), "to --as mcap, but to onnx"),
+        (("--as", "mcap", "--windows", "3"), "to --as mcap; it is of onnx"),
+        (("--as", "onnx"), "is a folder, and --as onnx is of a trained network"),
         (("nothing", "--as", "dsec"), "is no campaign or committed trial"),
     ],
 )
