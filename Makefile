@@ -15,16 +15,22 @@ unexport PYTHONDONTWRITEBYTECODE
 
 setup: $(DONE)
 
+# the core first: while one processor installs the rest, the other compiles kernels
+define install
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(PIP) .
+	$(BIN)/python .ci/kernels.py & kernels=$$!; \
+	$(PIP) '.[$(1)]'; installed=$$?; wait $$kernels; exit $$installed
+endef
+
 NEEDS := pyproject.toml setup.py constraints.txt
 $(DONE): $(NEEDS)
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) '.[dev]'
+	$(call install,dev)
 	touch $(DEMO) $(DONE)
 
 # only what the demo needs: no drivers, linters and formats
 $(DEMO): $(NEEDS)
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) '.[learn]'
+	$(call install,learn)
 	touch $(DEMO)
 
 demo: $(DEMO)

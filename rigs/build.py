@@ -41,7 +41,7 @@ from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.discovery import need_libraries
+from sliplab.rigs.discovery import need_libraries, need_video
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.truth import plate_course, watch_plate
 from sliplab.rigs.rig_file import RigFile
@@ -109,8 +109,9 @@ def build_rig(file: RigFile, should_stop: ShouldStop = never) -> Rig:
 
     Raises:
         RigError: a device that must be present at this stage, such as a camera, is missing.
-        ModuleNotFoundError: a maker's library is not installed.
+        ModuleNotFoundError: a maker's library, or one for video, is not installed.
     """
+    need_video(file)
     if file.driver == "mock":
         further = simulated_streams(file.streams)
         return simulated_rig(file, build_mock(file.scene, file.timing, further), should_stop)

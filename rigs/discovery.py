@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 
+from sliplab.protocols.later import need
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import Stream, named_drivers
+from sliplab.storage.streams import FRAMES_KIND
 
 
 def need_libraries(devices: DeviceSettings, streams: Mapping[str, Stream] | None = None) -> None:
@@ -18,8 +20,20 @@ def need_libraries(devices: DeviceSettings, streams: Mapping[str, Stream] | None
     """
     for _, driver, _settings in named_drivers(devices, streams or {}):
         for name in driver.libraries:
-            if find_spec(name) is None:
-                raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+            need(name)
+
+
+def need_video(file: RigFile) -> None:
+    """Check that what encodes a rig's frames is installed, and what draws simulated ones.
+
+    Raises:
+        ModuleNotFoundError: one of them is not installed.
+    """
+    further = any(stream.kind == FRAMES_KIND for stream in file.streams.values())
+    if further or ("frames" in file.cameras and file.frame_source == "video"):
+        need("av")
+        if file.simulated:
+            need("cv2")
 
 
 def ping_devices(

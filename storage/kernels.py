@@ -14,14 +14,34 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
+from multiprocessing import parent_process
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
 import numba
+from numba.core import event
 
 _IMPORT = re.compile(r"^from (sliplab[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 _USER = "~/.cache/sliplab"
+COMPILING = "compiling once for this version; this takes up to some minutes"
+
+
+class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Says on standard error when this process compiles its first kernel; workers say nothing."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self.said and parent_process() is None:
+            print(COMPILING, file=sys.stderr, flush=True)
+        self.said = True
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _FirstCompilation())
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -7,15 +7,20 @@ frame of a video and wherever a marker was lost; `analysis.labels.markers` follo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from sliplab.protocols.later import Later
 from sliplab.storage.kernels import njit
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = Later("cv2")
 
 Frame = NDArray[np.uint8]
 Floats = NDArray[np.float64]

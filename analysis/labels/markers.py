@@ -12,9 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
@@ -38,6 +37,12 @@ from sliplab.analysis.labels.marker_kernels import (
     WHOLE,
     follow,
 )
+from sliplab.protocols.later import Later
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = Later("cv2")
 
 AREA_TOLERANCE = 0.06
 """A marker whose area differs by more than this share from what it was is lost."""

@@ -11,15 +11,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.blobs import Floats, Frame, checked_frame
 from sliplab.analysis.labels.markers import FrameMarkers, MarkerTracker, MarkerTracks, stack_tracks
 from sliplab.analysis.labels.plate_kernels import cells, refine_square
+from sliplab.protocols.later import Later
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = Later("cv2")
 
 MAX_BRIDGED = 5
 """Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm

@@ -16,6 +16,8 @@ EXTRAS = {
         "pypylon",
         "dv_processing",
     ),
+    "video": ("av", "cv2"),
+    "parquet": ("pyarrow",),
     "learn": ("torch", "sinabs", "sklearn", "threadpoolctl"),
     "prefect": ("prefect",),
     "report": ("matplotlib", "jinja2", "bokeh"),

@@ -13,16 +13,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.later import Later
 from sliplab.rigs.scene.discs import MARGIN_PX, SHIFTS, add_noise, draw_discs, draw_still
 from sliplab.rigs.scene.lens import Lens
 from sliplab.rigs.scene.randomness import generator, key
 from sliplab.storage.kernels import njit
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = Later("cv2")
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

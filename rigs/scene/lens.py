@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
+from sliplab.protocols.later import Later
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F32, F64, U8
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = Later("cv2")
 
 
 class Lens:

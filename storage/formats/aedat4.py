@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
+from sliplab.protocols.later import Later
 from sliplab.storage.formats.flatbuffers import (
     GREY,
     FlatTable,
@@ -43,6 +43,11 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, U8, U16, EventChunk, FrameChunk
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+else:
+    pa = Later("pyarrow")
 
 LINE = b"#!AER-DAT4.0\r\n"
 EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import av
-import cv2
 import numpy as np
 
+from sliplab.protocols.later import Later
 from sliplab.storage.formats.foreign import MOST_PX, Damage, FormatError, grey
 from sliplab.storage.streams import U8
 from sliplab.storage.trials.video import video_url
+
+if TYPE_CHECKING:
+    import av
+    import cv2
+else:
+    av = Later("av")
+    cv2 = Later("cv2")
 
 _CONTAINERS = "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2"
 """Kinds of video that hold their own frames; others may name files and addresses to be read."""

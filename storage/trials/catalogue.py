@@ -21,20 +21,26 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.later import Later, installed, need
 from sliplab.protocols.plan import condition_columns
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+else:
+    pa = Later("pyarrow")
+    pq = Later("pyarrow.parquet")
 
 VERSION = 1
 """Of the index and of the catalogue's rows: a change of either counts on."""
@@ -190,9 +196,12 @@ def check_table_path(path: Path) -> None:
 
     Raises:
         InputError: it ends in something else than .csv, .parquet or .json.
+        ModuleNotFoundError: what writes Parquet is not installed.
     """
     if path.suffix not in (".csv", ".parquet", ".json"):
         raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
+    if path.suffix == ".parquet":
+        need("pyarrow")
 
 
 def _parquet(table: pd.DataFrame) -> bytes:
@@ -406,7 +415,9 @@ def _stamp(path: Path, settled: bool = False) -> str:
 
 
 def _read_index(store: Store) -> _Index | None:
-    """Read the index; None if there is none that can be used."""
+    """Read the index; None if there is none that can be used, or nothing that reads Parquet."""
+    if not installed("pyarrow"):
+        return None
     try:
         content = _path(store).read_bytes()
     except OSError:
@@ -435,6 +446,8 @@ def _write_index(
     store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Index
 ) -> None:
     """Write the index, where it can be written and reads again as it is."""
+    if not installed("pyarrow"):
+        return
     frame = table.copy()
     frame[_NAME] = known.names
     frame[_ROW] = [json.dumps(each) for each in rows]

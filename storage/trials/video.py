@@ -15,12 +15,17 @@ import threading
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import av
 import numpy as np
 
+from sliplab.protocols.later import Later
 from sliplab.storage.streams import U8
+
+if TYPE_CHECKING:
+    import av
+else:
+    av = Later("av")
 
 CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
 _QUEUE_FRAMES = 32

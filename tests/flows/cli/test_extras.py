@@ -70,9 +70,8 @@ CORE = (
     "trials STORE",
     "verify STORE",
     "migrate STORE",
-    "export STORE small --format aedat4 --output OUT/aedat4",
-    "export STORE small --format dsec --output OUT/dsec",
-    "export STORE small --labels --output OUT/labels.csv",
+    "export STORE small --as dsec --output OUT/dsec",
+    "export STORE small --as labels --output OUT/labels.csv",
 )
 
 
@@ -111,9 +110,16 @@ def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
 
 
 LACKING: dict[str, dict[str, str]] = {
+    "video": {
+        "collect pilot --rig mock --store OUT/new --trials 1": "av",
+    },
+    "parquet": {
+        "trials STORE --output OUT/trials.parquet": "pyarrow",
+        "export STORE small --as aedat4 --output OUT/aedat4": "pyarrow",
+    },
     "learn": {
         "train STORE": "torch",
-        "export-model STORE --out OUT/model": "torch",
+        "export-model STORE/models/small.pt --out OUT/model": "torch",
         "detect --rig rehearsal --model STORE/models/small.pt": "torch",
     },
     "prefect": {
