@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from multiprocessing import parent_process
@@ -34,7 +35,8 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba has no t
 
     def on_start(self, event: Any) -> None:
         if not self.said and parent_process() is None:
-            print(COMPILING, file=sys.stderr, flush=True)
+            with suppress(OSError, ValueError):  # closed, or its reader is gone
+                print(COMPILING, file=sys.stderr, flush=True)
         self.said = True
 
     def on_end(self, event: Any) -> None:

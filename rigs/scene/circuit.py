@@ -65,12 +65,6 @@ class Circuit(NamedTuple):
     """True if any memorised level falls."""
 
 
-def no_circuit() -> Circuit:
-    """Return an empty circuit, for pixels that need none."""
-    flat, line = np.empty((0, 0), np.int64), np.empty(0, np.int64)
-    return Circuit(np.empty((0, 0, 6)), flat, flat, flat, line, line, 0.0, 0.0, False)
-
-
 def new_circuit(on: F64, off: F64, leak_hz: F64, cutoff_hz: float) -> Circuit:
     """Return pixels with thresholds and leak rates, (height, width) each; dark so far."""
     cells = np.zeros((*on.shape, 6))

@@ -25,7 +25,6 @@ from sliplab.rigs.scene.circuit import (
     events_of_circuit,
     memorise_image,
     new_circuit,
-    no_circuit,
     start_cells,
 )
 from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, memorise_discs, widen
@@ -182,7 +181,7 @@ class MarkerSensor:
             optics.hot_hz,
             hot_places(optics.width, optics.height, optics.hot_pixels, seed),
         )
-        self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
+        self._circuit = self._new_circuit(seed) if optics.has_circuit else None
         self._light = steady()
         self._started = True
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
@@ -268,7 +267,7 @@ class MarkerSensor:
             self._pixels.state,
             self._pixels.seen,
         )
-        if optics.has_circuit:
+        if self._circuit is not None:
             # a camera that has run for long: each pixel is at a random point between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
             memorise_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
@@ -302,7 +301,8 @@ class MarkerSensor:
                 frequency (Hz), and true time (ns) from which it is so, in all later calls, too.
         """
         if not self._started:
-            start_cells(self._circuit, int(t_ns[0]))
+            if self._circuit is not None:
+                start_cells(self._circuit, int(t_ns[0]))
             self._started = True
         if flicker is not None and self._light.share == 0.0 and flicker[2] < t_ns[-1]:
             self._light = self._flickering(*flicker[:2], max(flicker[2], int(t_ns[0])))
@@ -325,7 +325,7 @@ class MarkerSensor:
     def _flickering(self, share: float, hz: float, since_ns: int) -> FlickeringLight:
         """Return a light that flickers from a true time on."""
         on = off = self.threshold
-        if self.optics.has_circuit:
+        if self._circuit is not None:
             on, off = self._circuit.cells[..., ON], self._circuit.cells[..., OFF]
         return new_flicker(share, hz, on, off, since_ns, self._trial)
 
@@ -389,7 +389,7 @@ def trace(
     phase_ns: int,
     of_pixels: Pixels,
     lists: RimLists,
-    circuit: Circuit,
+    circuit: Circuit | None,
     noise: Candidates,
     light: FlickeringLight,
     pending: I64,
@@ -405,7 +405,8 @@ def trace(
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
         camera: `CameraKernel`; phase_ns: of `readout.Scans`.
         of_pixels, lists: `Pixels` and `RimLists`, written.
-        circuit: pixels of `circuit`, which do all signal events where there are any.
+        circuit: pixels of `circuit`, which do all signal events where there are any; without them
+            their code is not compiled.
         noise: `noise.Candidates`, at least those of this time.
         light: `flicker.Flicker`, written.
         pending: packed events of scans that were not complete, ns after `row_ns[0]`, less a period
@@ -488,7 +489,7 @@ def trace(
             for k in range(a, b):
                 since[k], until[k] = rows[k] - rows[a], rows[k + 1] - rows[a]
         inner_weights(first, blocks, weights, inner)
-        if circuit.awake.shape[0] > 0:
+        if circuit is not None:
             events, n = events_of_circuit(
                 circuit,
                 path,
@@ -516,7 +517,7 @@ def trace(
             if capacity < events.shape[0]:
                 capacity = events.shape[0]
                 other = np.empty(capacity, np.int64)
-        for i in range(path.shape[0] if circuit.awake.shape[0] == 0 else 0):
+        for i in range(path.shape[0] if circuit is None else 0):
             if stands_still(path, i, begin, stop):
                 continue
             fit_blocks(path, i, begin, first, blocks, chord, inverse, weights, inner, curve)
