@@ -35,7 +35,9 @@ class Finding(Generic[ResultT]):
         failed: the command ends with exit code 1, such as for a limit that is exceeded.
         error: is raised when everything is written, in place of anything that is shown.
         more: further arguments of `Study.view` and `shown`: what the result does not hold.
-        named: further files and folders, by their keys in the JSON of the command.
+        named: further entries of the JSON of the command, in place of the result's; paths are
+            written as text.
+        dry: a plan of what would be done; nothing is written.
     """
 
     result: ResultT
@@ -44,7 +46,8 @@ class Finding(Generic[ResultT]):
     failed: bool = False
     error: Exception | None = None
     more: tuple[Any, ...] = ()
-    named: Mapping[str, Path] = field(default_factory=dict)
+    named: Mapping[str, Any] = field(default_factory=dict)
+    dry: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,9 @@ def write_tables(folder: Path, stem: str, result: Document) -> None:
     for name, rows in tables(result.to_json(), simulated=getattr(result, "simulated", None)):
         make_folder(folder)
         frame = pd.DataFrame(rows)
+        for column in frame:
+            if frame[column].dropna().map(type).nunique() > 1:  # numbers and words: all as text
+                frame[column] = frame[column].map(str, na_action="ignore")
         place = folder / safe_name(f"{stem}.{name}")
         write_text(place.with_name(f"{place.name}.csv"), frame.to_csv(index=False))
         write_bytes(place.with_name(f"{place.name}.parquet"), frame.to_parquet(index=False))

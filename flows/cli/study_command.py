@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -17,18 +18,22 @@ def study_app(study: Study[Any]) -> typer.Typer:
 
     def run(as_json: bool, **options: Any) -> None:
         found = study.measure(**options)
-        page = study.write(found)
+        files = {} if found.dry else {"page": study.write(found)}
         if found.error is not None:
             raise found.error
         if as_json:
-            places = {name: str(path) for name, path in {"page": page, **found.named}.items()}
-            console.print_json({**places, **found.result.to_json()})
+            entries = {
+                name: str(entry) if isinstance(entry, Path) else entry
+                for name, entry in {**files, **found.named}.items()
+            }
+            console.print_json({**entries, **found.result.to_json(), **entries})
         for part in study.shown(found.result, *found.more):
             if isinstance(part, str):
                 console.say(part)
             elif not as_json:
                 console.print_table(part.caption, part.columns, part.rows, spare=part.spare)
-        console.say(f"page: {page}")
+        for name, path in files.items():
+            console.say(f"{name}: {path}")
         if found.failed:
             raise typer.Exit(console.FAILED)
 

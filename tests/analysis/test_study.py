@@ -13,7 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from sliplab.analysis.report.page import Table
-from sliplab.analysis.study import Finding, Study, tables
+from sliplab.analysis.study import Finding, Study, tables, write_tables
 from sliplab.flows.cli.study_command import study_app
 from sliplab.protocols import InputError
 from sliplab.storage.schema.document import Bool, Document, Number, Part
@@ -99,6 +99,29 @@ def test_json_names_further_files_and_lines_stand_beside_it(tmp_path: Path) -> N
     assert json.loads(done.stdout)["folder"] == str(tmp_path)
     assert "rates of the hold" in done.stderr
     assert "rate (1/s)" not in done.stderr
+
+
+def test_json_entries_replace_those_of_the_result(tmp_path: Path) -> None:
+    made = study(tmp_path, named={"rates": [1], "made": 2})
+    done = CliRunner().invoke(study_app(made), ["--json"])
+    found = json.loads(done.stdout)
+    assert (found["rates"], found["made"], found["simulated"]) == ([1], 2, True)
+    assert len(made.read(tmp_path / "out" / "rates.json").rates) == 2
+
+
+def test_dry_run_writes_nothing(tmp_path: Path) -> None:
+    done = CliRunner().invoke(study_app(study(tmp_path, dry=True)), ["--json"])
+    assert set(json.loads(done.stdout)) == {"simulated", "rates"}
+    assert "page" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_column_of_numbers_and_words_becomes_text(tmp_path: Path) -> None:
+    document = Document.model_validate({"levels": [{"value": 2.5}, {"value": "8 bit"}, {}]})
+    write_tables(tmp_path, "s", document)
+    column = pd.read_parquet(tmp_path / "s.levels.parquet")["value"]
+    assert [*column.dropna()] == ["2.5", "8 bit"]
+    assert column.isna().sum() == 1
 
 
 @pytest.mark.parametrize(
