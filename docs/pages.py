@@ -71,6 +71,16 @@ _DOCUMENTS = {
         "The study of reflexes",
         "`OUT/reflex.json`: drops that reflexes prevent ([Reflexes](../reflex.md)).",
     ),
+    "tradeoff": (
+        "Speed against error",
+        "`report/detector_tradeoff.json`: settings of the detector, varied on a store's trials "
+        "([Speed against error](../tradeoff.md#the-detector)).",
+    ),
+    "generalise": (
+        "Levels left out and other skins",
+        "`derived/generalisation/results.json`: accuracy on what the network was not trained on "
+        "([Metrics](../metrics.md)).",
+    ),
     "bench": (
         "The table of the bench",
         "`FOLDER/bench.json`: detectors on the scenes of the bench ([The bench](../bench.md)).",

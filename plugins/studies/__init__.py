@@ -6,7 +6,11 @@ from sliplab.protocols.plugin import Plugin
 
 _STUDIES = "sliplab.plugins.studies"
 PLUGIN = Plugin(
-    commands=dict.fromkeys(("tradeoff", "generalise", "guesses"), f"{_STUDIES}.command:app"),
+    commands={"guesses": f"{_STUDIES}.command:app"},
+    studies={
+        "generalise": f"{_STUDIES}.generalise.study:STUDY",
+        "tradeoff": f"{_STUDIES}.detector.study:STUDY",
+    },
     sections={
         "skins": f"{_STUDIES}.generalise.section:SECTION",
         "tradeoff": f"{_STUDIES}.section:SECTION",

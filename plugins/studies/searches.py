@@ -6,13 +6,17 @@ Seconds are expected from nothing, on two cores, where trials are simulated.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+from sliplab.analysis.study import Finding, Study
 from sliplab.analysis.study_plan import Search, StudyPlan
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.plugins.studies.detector.grid import Axes
 from sliplab.plugins.studies.detector.run import tradeoff_detector
 from sliplab.plugins.studies.detector.search import SearchSize
+from sliplab.plugins.studies.detector.study import STUDY as TRADEOFF
 from sliplab.plugins.studies.generalise.run import SKINS, measure_generalisation
+from sliplab.plugins.studies.generalise.study import STUDY as GENERALISE
 from sliplab.plugins.studies.section import RESULT
 
 LEVEL_S = 0.0004
@@ -32,7 +36,7 @@ def generalisation(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Se
         "generalisation",
         "results",
         seconds,
-        lambda store, campaigns: measure_generalisation(store, campaigns).made,
+        lambda store, campaigns: _written(GENERALISE, measure_generalisation(store, campaigns)),
     )
 
 
@@ -44,7 +48,14 @@ def detector(planned: StudyPlan, run_requests: Sequence[RunRequest]) -> Search |
         "detector search",
         "trainings",
         SEARCH_S,
-        lambda store, campaigns: tradeoff_detector(
-            store, campaigns, (store.folder / RESULT.file).parent, SIZE, AXES
-        )["made"],
+        lambda store, campaigns: _written(
+            TRADEOFF,
+            tradeoff_detector(store, campaigns, (store.folder / RESULT.file).parent, SIZE, AXES),
+        ),
     )
+
+
+def _written(study: Study[Any], found: Finding[Any]) -> int:
+    """Write the files of a study; return how much was measured for it now."""
+    study.write(found)
+    return int(found.named["made"])

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from sliplab.analysis.report.page import Content, Figure, Table, number
 from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.analysis.report.programs import CommandResult
+from sliplab.plugins.studies.detector.document import DetectorRow, DetectorTradeoff, mean
 from sliplab.plugins.studies.plot import AxisPair, DetectorPoint, cost_and_error
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
@@ -48,14 +47,13 @@ def tradeoff_section(store: Store, found: Json | None) -> TradeoffSection:
     command = RESULT.command(store)
     if found is None:
         return TradeoffSection(command)
-    with RESULT.shape_checked():
-        rows = list(found["rows"])
-        search = _draw_search(rows, simulated=bool(found["simulated"]))
-        table, front = _search_table(rows)
+    result = RESULT.parse(DetectorTradeoff, found)
+    search = _draw_search(result.rows, simulated=result.simulated)
+    table, front = _search_table(result.rows)
     page = (store.folder / RESULT.file).with_suffix(".html")
     link = os.path.relpath(page, store.folder / "report").replace(os.sep, "/")
     link = link if page.exists() else ""
-    return TradeoffSection(command, search, table, MOST, front, len(rows), link)
+    return TradeoffSection(command, search, table, MOST, front, len(result.rows), link)
 
 
 SETTINGS = {
@@ -82,39 +80,35 @@ MOST = 25
 """Rows of the front that are listed."""
 
 
-def _scaled(row: Json, key: tuple[str, str]) -> float | None:
+def _scaled(row: DetectorRow, key: tuple[str, str]) -> float | None:
     """Return the mean over seeds; None where one is missing."""
-    values = row[key[0]].get(key[1]) or []
-    if not values or any(value is None for value in values):
-        return None
-    return FIGURES[key][1] * float(np.mean(values))
+    found = mean(getattr(row, key[0]).get(key[1], ()))
+    return None if found is None else FIGURES[key][1] * found
 
 
-def _draw_search(rows: Sequence[Json], *, simulated: bool) -> Figure:
+def _draw_search(rows: Sequence[DetectorRow], *, simulated: bool) -> Figure:
     cost = ("work", "us_per_s")
     panels = [
         AxisPair(cost[1], key[1], FIGURES[cost][0], f"{FIGURES[key][0]}, test trials")
         for key in (("test", "mean_ms"), ("test", "strict"))
     ]
     points = [
-        DetectorPoint(
-            {key[1]: _scaled(row, key) for key in FIGURES}, bool(row["front"]), bool(row["paper"])
-        )
+        DetectorPoint({key[1]: _scaled(row, key) for key in FIGURES}, row.front, row.paper)
         for row in rows
     ]
     data: dict[str, Sequence[object]] = {
-        **{heading: [row[name] for row in rows] for name, heading in SETTINGS.items()},
+        **{heading: [getattr(row, name) for row in rows] for name, heading in SETTINGS.items()},
         **{FIGURES[key][0]: [_scaled(row, key) for row in rows] for key in FIGURES},
-        "on the front": [row["front"] for row in rows],
+        "on the front": [row.front for row in rows],
     }
     svg = cost_and_error(points, panels, simulated=simulated)
     return Figure(svg, name="tradeoff-detector", data=data)
 
 
-def _search_table(rows: Sequence[Json]) -> tuple[Table, int]:
+def _search_table(rows: Sequence[DetectorRow]) -> tuple[Table, int]:
     """List the paper's settings and the front, by latency; and count them."""
-    shown = [row for row in rows if row["paper"]] + sorted(
-        (row for row in rows if row["front"] and not row["paper"]),
+    shown = [row for row in rows if row.paper] + sorted(
+        (row for row in rows if row.front and not row.paper),
         key=lambda row: _scaled(row, ("test", "mean_ms")) or float("inf"),
     )
     words = (
@@ -123,8 +117,8 @@ def _search_table(rows: Sequence[Json]) -> tuple[Table, int]:
     )
     cells = [
         [
-            "paper's" if row["paper"] else "front",
-            words.format(**row),
+            "paper's" if row.paper else "front",
+            words.format(**row.to_json()),
             *(number(_scaled(row, key), digits) for key, (_, _, digits) in FIGURES.items()),
         ]
         for row in shown[:MOST]

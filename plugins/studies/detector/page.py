@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
+from sliplab.analysis.report.page import Figure, Table, number, percent
+from sliplab.plugins.studies.detector.document import (
+    DetectorRow,
+    DetectorTradeoff,
+    FactorValue,
+    RulePair,
+    SeedDifference,
+    mean,
+)
 from sliplab.plugins.studies.detector.rows import (
     FACTORS,
     LOOSE,
     MOST_MISSED,
     OBJECTIVES,
-    DetectorRow,
-    mean,
     short_list,
 )
 from sliplab.plugins.studies.plot import (
@@ -60,29 +65,27 @@ DRAWN = {
 }
 """Factors on figures in the plots."""
 
-Result = Mapping[str, Any]
 
-
-def render(result: Result) -> str:
-    """Return the page as text; everything in it is escaped but the figures' SVG."""
-    rows, simulated, trials = rows_of(result), result["simulated"], result["trials"]
-    values = {
-        **result,
+def view(result: DetectorTradeoff) -> dict[str, object]:
+    """Return what the page shows."""
+    rows, simulated = result.rows, result.simulated
+    detectors = distinct(rows)
+    values: dict[str, object] = {
         "loose": LOOSE,
         "most_missed": MOST_MISSED,
-        "not_tried": Table(("left out", "why"), [[*each] for each in result["left_out"].items()]),
+        "not_tried": Table(("left out", "why"), [[*each] for each in result.left_out.items()]),
         "warned": Table(
-            ("network", "warning"), [[run, "; ".join(of)] for run, of in result["warnings"].items()]
+            ("network", "warning"), [[run, "; ".join(of)] for run, of in result.warnings.items()]
         ),
-        "detectors": distinct(rows),
+        "detectors": detectors,
     }
     if rows:
         budgets = [[percent(budget, 0), *cells(row)] for budget, row in short_list(rows)]
-        front = [row for row in values["detectors"] if row.front]
-        comparisons = [(rows[item["row"]], item) for item in result["comparisons"]]
+        front = [row for row in detectors if row.front]
+        comparisons = [(rows[item.row], item) for item in result.comparisons]
         values |= {
             "short_list": Table(("budget", *COLUMNS), budgets),
-            "front": _front(rows, leads=bool(trials["falling"])),
+            "front": _front(rows, leads=bool(result.trials.falling)),
             "on_front": len(front),
             "on_both": sum(row.front_validation for row in front),
             "most": MOST_ROWS,
@@ -91,14 +94,9 @@ def render(result: Result) -> str:
             "lines": _lines(comparisons, simulated),
             "factors": _factors(comparisons),
             "cross": _cross(rows),
-            "pairs": _pairs(result["pairs"]),
+            "pairs": _pairs(result.pairs),
         }
-    return render_page(Path(__file__).with_name("page.html"), **values)
-
-
-def rows_of(result: Result) -> list[DetectorRow]:
-    """Return the rows of a result."""
-    return [DetectorRow.of_json(row) for row in result["rows"]]
+    return values
 
 
 def _front(rows: Sequence[DetectorRow], *, leads: bool) -> Table:
@@ -120,13 +118,12 @@ def _points(rows: Sequence[DetectorRow], simulated: bool) -> Figure:
     return Figure(front_panels(points, PANELS, simulated=simulated))
 
 
-Comparisons = Sequence[tuple[DetectorRow, Mapping[str, Any]]]
-"""Rows on the lines through the paper's setting, as `comparisons` of `detector_rows` has them."""
+Comparisons = Sequence[tuple[DetectorRow, FactorValue]]
+"""Rows on the lines through the paper's setting."""
 
 
-def _level(item: Mapping[str, Any]) -> str:
-    value = item["value"]
-    return value if isinstance(value, str) else f"{value:g}"
+def _level(item: FactorValue) -> str:
+    return item.value if isinstance(item.value, str) else f"{item.value:g}"
 
 
 def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
@@ -136,8 +133,8 @@ def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
             "strict": seed_range(row.test["strict"], 100),
             "mean_ms": seed_range(row.test["mean_ms"], 1),
         }
-        bar = FactorBar(_level(item), item["paper"], ranges)
-        bars.setdefault(FACTORS[item["factor"]], []).append(bar)
+        bar = FactorBar(_level(item), item.paper, ranges)
+        bars.setdefault(FACTORS[item.factor], []).append(bar)
     figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
     return Figure(factor_lines(bars, figures, simulated=simulated))
 
@@ -147,12 +144,12 @@ def _factors(comparisons: Comparisons) -> Table:
     compared = {"strict": points, "mean_ms": (1, "ms"), "false_early_either": points}
     table = []
     for row, item in comparisons:
-        found = item["difference"]
-        shown = ["paper's" if item["paper"] else "–"] * 3
-        if found is not None and not item["paper"]:
+        found = item.difference
+        shown = ["paper's" if item.paper else "–"] * 3
+        if found is not None and not item.paper:
             shown = [format_difference(found[name], *how) for name, how in compared.items()]
         means = [spread(row.test["strict"], 100, 1), spread(row.test["mean_ms"], 1, 0)]
-        table.append([f"{FACTORS[item['factor']]}: {_level(item)}", *means, *shown])
+        table.append([f"{FACTORS[item.factor]}: {_level(item)}", *means, *shown])
     columns = (
         "factor",
         "strict (%)",
@@ -186,13 +183,14 @@ def _cross(rows: Sequence[DetectorRow]) -> Table:
     return Table(["window", *(f"cells of {pool} px" for pool in pools)], table)
 
 
-def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Table:
+def _pairs(pairs: Sequence[RulePair]) -> Table:
     found = {
-        (pair["smoothing"], pair["margin"]): f"{number(pair['mean_ms'], 0)} ms, "
-        f"{hundred(pair['false_early_either'], 0)} / {hundred(pair['lost_either'], 0)} %"
+        (pair.smoothing, pair.margin): f"{number(pair.mean_ms, 0)} ms, "
+        f"{hundred(pair.false_early_either, 0)} / {hundred(pair.lost_either, 0)} %"
         for pair in pairs
     }
-    smoothings, margins = (sorted({key[k] for key in found}) for k in (0, 1))
+    smoothings = sorted({pair.smoothing for pair in pairs})
+    margins = sorted({pair.margin for pair in pairs})
     table = [[f"{s}", *(found[s, margin] for margin in margins)] for s in smoothings]
     return Table(["windows", *(f"margin {margin:g}" for margin in margins)], table)
 
@@ -216,9 +214,9 @@ def ordered_front(rows: Sequence[DetectorRow], most: int | None = None) -> list[
     return [*(row for row in rows if row.paper), *sorted(front, key=late)[:most]]
 
 
-def short_table(result: Result) -> tuple[Sequence[str], list[list[str]]]:
-    """Return the paper's row and the short list for a terminal: columns and rows; means only."""
-    rows = rows_of(result)
+def short_table(result: DetectorTradeoff) -> Table:
+    """Return the paper's row and the short list for a terminal; means only."""
+    rows = result.rows
     listed = [("paper's", row) for row in rows if row.paper]
     listed += [(percent(budget, 0), row) for budget, row in short_list(rows)]
     table = []
@@ -237,7 +235,8 @@ def short_table(result: Result) -> tuple[Sequence[str], list[list[str]]]:
                 percent(mean(test["lost_either"])),
             ]
         )
-    return TERMINAL, table
+    simulated = " (simulated)" if result.simulated else ""
+    return Table(TERMINAL, table, f"The fastest detectors by false early trials{simulated}")
 
 
 def cells(row: DetectorRow) -> list[str]:
@@ -279,15 +278,15 @@ def spread(values: Sequence[float | None], scale: float, digits: int) -> str:
     return text if len(values) < 2 else f"{text} ({found[1]:.{digits}f} to {found[2]:.{digits}f})"
 
 
-def format_difference(difference: Mapping[str, Any], scale: float, unit: str) -> str:
+def format_difference(difference: SeedDifference, scale: float, unit: str) -> str:
     """Return a difference, its interval, and its significance over seeds, as text."""
-    if difference["mean"] is None:
+    if difference.mean is None:
         return "–"
-    text = f"{scale * difference['mean']:+.1f}".replace("-", "−")
-    if difference["told"] is None:
+    text = f"{scale * difference.mean:+.1f}".replace("-", "−")
+    if difference.high is None:
         return f"{text} {unit}"
-    half = scale * (difference["high"] - difference["mean"])
-    return f"{text} ± {half:.1f} {unit}{', more than seeds' if difference['told'] else ''}"
+    half = scale * (difference.high - difference.mean)
+    return f"{text} ± {half:.1f} {unit}{', more than seeds' if difference.told else ''}"
 
 
 def hundred(value: float | None, digits: int = 1) -> str:

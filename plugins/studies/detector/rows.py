@@ -13,9 +13,8 @@ one in twenty would exclude zero by chance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +25,7 @@ from sliplab.analysis.detectors.rule_sweep import Trials, choose_pair, score, sw
 from sliplab.analysis.metrics.paired import paired_difference
 from sliplab.analysis.metrics.pareto import front
 from sliplab.analysis.sweeps.runner import Arrays
+from sliplab.plugins.studies.detector.document import BySeed, DetectorRow, DetectorTradeoff, mean
 from sliplab.plugins.studies.detector.grid import PAPER, NetworkSetting, counted_stride, strides
 from sliplab.plugins.studies.detector.search import (
     PRECISIONS,
@@ -80,76 +80,8 @@ COMPARED = {
 FALLING = ("lead_min_ms", "missed", "late", "false_early", "trials")
 PAIR_FIGURES = ("mean_ms", "p95_ms", "lost_either", "false_early_either")
 
-BySeed = dict[str, list[Any]]
-"""Figures by name, a value for each seed; None where a seed has no such figure."""
 Detections = tuple[npt.NDArray[np.int64], ...]
 """Detections of one seed in validation, test and falling trials: int64 (n, S, M, 2) each."""
-
-
-@dataclass(frozen=True)
-class DetectorRow:
-    """One detector.
-
-    Attributes:
-        smoothing: windows; margin: spikes.
-        paper: it is the paper's detector.
-        validation, test: figures of `analysis.detectors.rule_sweep.Figures`, and ``strict``.
-        falling: the figures `FALLING`; None without such trials.
-        work: microseconds and synaptic operations, a window and a second.
-        front, front_validation: it is on the Pareto front of test or of validation trials.
-    """
-
-    setting: NetworkSetting
-    precision: str
-    stride_ms: int
-    rule: str
-    smoothing: int
-    margin: float
-    paper: bool
-    seeds: list[int]
-    validation: BySeed
-    test: BySeed
-    falling: BySeed | None
-    work: BySeed
-    front: bool = False
-    front_validation: bool = False
-
-    def as_json(self) -> Json:
-        """Return the row as plain data, the setting's values among the others."""
-        data = asdict(self)
-        return {**data.pop("setting"), **data}
-
-    @staticmethod
-    def of_json(data: Json) -> DetectorRow:
-        """Return the row that `as_json` gave.
-
-        Raises:
-            KeyError: it lacks a value.
-        """
-        setting = NetworkSetting(
-            **{field.name: data[field.name] for field in fields(NetworkSetting)}
-        )
-        names = [field.name for field in fields(DetectorRow) if field.name != "setting"]
-        return DetectorRow(setting, **{name: data[name] for name in names})
-
-    def value(self, name: str) -> Any:
-        """Return a setting of the detector by its name in `as_json`."""
-        return getattr(self.setting if hasattr(self.setting, name) else self, name)
-
-    def objective(self, name: str, part: str = "test") -> float | None:
-        """Return the mean over seeds of one of `OBJECTIVES`."""
-        return mean((self.work if name in self.work else getattr(self, part))[name])
-
-    @property
-    def detector(self) -> tuple[Any, ...]:
-        """All but the rule's name: two rules may have chosen the same pair."""
-        return (self.setting, self.precision, self.stride_ms, self.smoothing, self.margin)
-
-
-def mean(values: Sequence[float | None]) -> float | None:
-    """Return the mean over seeds; None where a seed has no such figure."""
-    there = [value for value in values if value is not None]
-    return float(np.mean(there)) if len(there) == len(values) and there else None
 
 
 class _Truth:
@@ -230,7 +162,7 @@ def make_rows(
     on = {part: front(_costs(rows, part)) for part in ("test", "validation")}
     marks = zip(on["test"], on["validation"], strict=True)
     return [
-        replace(row, front=bool(test), front_validation=bool(validation))
+        row.model_copy(update={"front": bool(test), "front_validation": bool(validation)})
         for row, (test, validation) in zip(rows, marks, strict=True)
     ], left_out
 
@@ -239,25 +171,29 @@ def _rows(
     truth: _Truth, setting: NetworkSetting, precision: str, there: Sequence[tuple[Json, Arrays]]
 ) -> list[DetectorRow]:
     rows = []
-    figures = [one for one, _ in there]
+    measured = [one["precisions"][precision] for one, _ in there]
     for stride in strides(setting.length_ms, truth.finest_ms):
         each = [truth.detect(a, precision, setting.length_ms, stride) for _, a in there]
         for rule, pair in zip(RULES, truth.choose(each), strict=True):
             own = precision == PRECISIONS[0] and rule == RULES[0]
-            rows.append(
-                DetectorRow(
-                    setting,
-                    precision,
-                    stride,
-                    rule,
-                    SMOOTHINGS[pair[0]],
-                    truth.margins[pair[1]],
-                    setting == PAPER and stride == PAPER.length_ms and own,
-                    [one["seed"] for one in figures],
-                    *_figures(truth, pair, [one["precisions"][precision] for one in figures], each),
-                    _work([one["precisions"][precision] for one in figures], 1000 / stride),
-                )
-            )
+            validation, test, falling = _figures(truth, pair, measured, each)
+            row = {
+                **asdict(setting),
+                "precision": precision,
+                "stride_ms": stride,
+                "rule": rule,
+                "smoothing": SMOOTHINGS[pair[0]],
+                "margin": truth.margins[pair[1]],
+                "paper": setting == PAPER and stride == PAPER.length_ms and own,
+                "seeds": [one["seed"] for one, _ in there],
+                "validation": validation,
+                "test": test,
+                "falling": falling,
+                "work": _work(measured, 1000 / stride),
+                "front": False,
+                "front_validation": False,
+            }
+            rows.append(DetectorRow.model_validate(row))
     return rows
 
 
@@ -268,11 +204,11 @@ def _figures(
 
     def scores(part: int, onsets: Trials) -> BySeed:
         found = [vars(score(one[part][:, pair[0], pair[1]], onsets)) for one in each]
-        return {name: [row[name] for row in found] for name in found[0]}
+        return {name: tuple(row[name] for row in found) for name in found[0]}
 
     validation, test = scores(0, truth.validation), scores(1, truth.test)
-    validation["strict"] = [one["validation"]["strict"] for one in measured]
-    test["strict"] = [one["test"]["strict"] for one in measured]
+    validation["strict"] = tuple(one["validation"]["strict"] for one in measured)
+    test["strict"] = tuple(one["test"]["strict"] for one in measured)
     if truth.falling is None:
         return validation, test, None
     falling = scores(2, truth.falling)
@@ -281,11 +217,11 @@ def _figures(
 
 def _work(measured: Sequence[Json], per_s: float) -> BySeed:
     names = ("us_single", "us_batched", "synaptic_operations")
-    work = {name: [one[name] for one in measured] for name in names}
+    work = {name: tuple(one[name] for one in measured) for name in names}
     return {
         **work,
-        "us_per_s": [per_s * value for value in work["us_single"]],
-        "synaptic_operations_per_s": [per_s * value for value in work["synaptic_operations"]],
+        "us_per_s": tuple(per_s * value for value in work["us_single"]),
+        "synaptic_operations_per_s": tuple(per_s * v for v in work["synaptic_operations"]),
     }
 
 
@@ -364,7 +300,7 @@ def comparisons(rows: Sequence[DetectorRow]) -> list[Json]:
         found += [
             {
                 "factor": factor,
-                "value": rows[at].value(factor),
+                "value": getattr(rows[at], factor),
                 "paper": rows[at] is start,
                 "row": at,
                 "difference": None if start is None else _differences(rows[at], start),
@@ -379,7 +315,7 @@ def _line(rows: Sequence[DetectorRow], factor: str) -> list[int]:
     words = (*PRECISIONS, *RULES)
 
     def order(at: int) -> float:
-        value = rows[at].value(factor)
+        value = getattr(rows[at], factor)
         return float(words.index(value) if isinstance(value, str) else value)
 
     others = [name for name in FACTORS if name != factor]
@@ -400,7 +336,7 @@ def _at_base(row: DetectorRow, factor: str) -> bool:
         "precision": "trained",
         "rule": "chosen",
     }
-    return bool(row.value(factor) == base[factor])
+    return bool(getattr(row, factor) == base[factor])
 
 
 def _differences(row: DetectorRow, start: DetectorRow) -> dict[str, Json]:
@@ -423,7 +359,7 @@ def table(rows: Sequence[DetectorRow], simulated: bool) -> pd.DataFrame:
 
 def _flat(row: DetectorRow, simulated: bool) -> Json:
     found: Json = {
-        name: row.value(name)
+        name: getattr(row, name)
         for name in ("length_ms", "step_ms", "pool_px", "precision", "stride_ms", "rule")
     }
     found |= {"width_factor": row.setting.width, "smoothing_windows": row.smoothing}
@@ -461,8 +397,8 @@ _UNITS = {
 
 def search_result(
     search: DetectorSearch, full: bool, simulated: bool, advance: Callable[[], None] = lambda: None
-) -> Json:
-    """Return all numbers of the stored runs, as plain data.
+) -> DetectorTradeoff:
+    """Return all numbers of the stored runs.
 
     Args:
         full: every value of the factors was tried with every other.
@@ -470,7 +406,7 @@ def search_result(
     """
     rows, left_out = make_rows(search, advance)
     trials = search.trials
-    return {
+    found = {
         **plan(search, simulated),
         "full": full,
         "left_out": {**search.grid.left_out, **left_out},
@@ -482,11 +418,12 @@ def search_result(
         "false_early_ms": trials.settings.detection.false_early_ms,
         "false_early_rate": trials.settings.detection.false_early_rate,
         "objectives": {k: "low" if sign > 0 else "high" for k, sign in OBJECTIVES.items()},
-        "rows": [row.as_json() for row in rows],
+        "rows": rows,
         "comparisons": comparisons(rows),
         "pairs": pair_table(search),
         "warnings": search.warnings(),
     }
+    return DetectorTradeoff.model_validate(found)
 
 
 def plan(search: DetectorSearch, simulated: bool) -> Json:

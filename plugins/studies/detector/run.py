@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.study import Finding
 from sliplab.flows.running import console
-from sliplab.plugins.studies.detector import page
+from sliplab.plugins.studies.detector.document import DetectorTradeoff
 from sliplab.plugins.studies.detector.grid import Axes, make_grid
-from sliplab.plugins.studies.detector.rows import DetectorRow, plan, search_result, table
+from sliplab.plugins.studies.detector.rows import plan, search_result, table
 from sliplab.plugins.studies.detector.search import STEP, DetectorSearch, SearchSize, search_trials
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import write_json, write_text
+from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
-PAGE, NUMBERS, TABLE = (f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv"))
+STEM = "detector_tradeoff"
 
 
 def detector_search(
@@ -57,18 +57,18 @@ def tradeoff_detector(
     reviewed: bool = False,
     minutes: float | None = None,
     dry_run: bool = False,
-) -> dict[str, Any]:
-    """Make what is missing, and write page, numbers and table into `folder`.
+) -> Finding[DetectorTradeoff]:
+    """Train what is missing, and write the table of means into `folder`.
 
     Args:
+        folder: of page, numbers and table.
         full: every value of the factors with every other.
         reviewed: people's decisions are applied to the labels.
         minutes: no run is started after so many; the page then shows the finished ones.
-        dry_run: only report the pending work and its estimated time.
+        dry_run: only plan: report the pending work and its estimated time.
 
     Returns:
-        the numbers and how many runs were ``made`` for them, or what there is to do and
-        `estimated_s`.
+        the numbers, named ``made`` how many trainings were made for them; or a plan.
 
     Raises:
         InputError: a value that no network can have, or a `folder` that is not a folder.
@@ -94,7 +94,8 @@ def tradeoff_detector(
         seconds = sum(sum(parts.values()) for parts in expected.values())
         console.say(f"{message}; the others take about {console.duration(seconds)}")
         if dry_run:
-            return {**to_do, "estimated_s": round(seconds, 1)}
+            planned = {**to_do, "estimated_s": round(seconds, 1)}
+            return Finding(DetectorTradeoff.model_validate(planned), folder, dry=True)
         began = time.monotonic()
         with console.bar("trade-off (s, estimated)", round(seconds)) as bar:
             made = search.sweep.run(
@@ -104,10 +105,7 @@ def tradeoff_detector(
             )
     with console.bar("judge (settings)", len(settings)) as bar:
         result = search_result(search, full, store.simulated, bar.advance)
-    rows = [DetectorRow.of_json(row) for row in result["rows"]]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / NUMBERS, result)
-    text = table(rows, store.simulated).to_csv(index=False, lineterminator="\n")
-    write_text(folder / TABLE, text)
-    write_text(folder / PAGE, page.render(result))
-    return {**result, "made": made}
+    make_folder(folder)
+    means = table(result.rows, store.simulated).to_csv(index=False, lineterminator="\n")
+    write_text(folder / f"{STEM}.csv", means)
+    return Finding(result, folder, STEM, named={"made": made})

@@ -33,7 +33,11 @@ from sliplab.analysis.windows.sample_sets import (
     several,
     split_trials,
 )
-from sliplab.plugins.studies.document import GeneralisationResults, NotTrained, UnseenScores
+from sliplab.plugins.studies.generalise.document import (
+    GeneralisationResults,
+    NotTrained,
+    UnseenScores,
+)
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.factors import in_canonical_unit
 from sliplab.protocols.hashing import hash_integer
@@ -44,7 +48,7 @@ from sliplab.storage.files import make_folder, write_bytes, write_text
 from sliplab.storage.schema.document import Part
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import Store, StoreError
 
 STEP, FILE, TABLE, VERSION = "generalisation", "results.json", "results.md", 1
 SPLITS = ("train", "validation", "test")
@@ -182,6 +186,9 @@ class Generalisation:
     Args:
         store: labelled, with a trained network.
         epochs: of each training, instead of the protocol's.
+
+    Raises:
+        StoreError: a trial has no label yet.
     """
 
     def __init__(self, store: Store, campaigns: list[Collected], epochs: int | None = None) -> None:
@@ -275,11 +282,19 @@ class Generalisation:
 
 
 def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, list[TrialRef]]:
-    """Return the samples of all parts of the split, and their trials in the samples' order."""
+    """Return the samples of all parts of the split, and their trials in the samples' order.
+
+    Raises:
+        StoreError: a trial has no label yet.
+    """
     labels = StoreLabels(store)
+    refs = [ref for split in SPLITS for ref in split_trials(campaigns, split)]
+    for item, trial, recording in refs:
+        if not labels.fresh(item, recording):
+            raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
     parts = [load_samples(labels, campaigns, split) for split in SPLITS]
     joined = SampleSet.join(parts, campaigns[0].settings.windows)
-    found = by_id([ref for split in SPLITS for ref in split_trials(campaigns, split)])
+    found = by_id(refs)
     return joined, [found[name] for name in joined.trials]
 
 

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_models
+from sliplab.analysis.study import Finding
 from sliplab.analysis.sweeps.runner import SweepTask, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
-from sliplab.plugins.studies.document import NotTrained, UnseenScores
+from sliplab.plugins.studies.generalise.document import GeneralisationResults, UnseenScores
 from sliplab.plugins.studies.generalise.results import (
     STEP,
     Generalisation,
@@ -28,39 +27,12 @@ from sliplab.plugins.studies.generalise.results import (
     score_windows,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
 SKIN_SEEDS = 101
 """Seed of the first other skin."""
 SKINS, TRIALS = 5, 36
 """Other skins, and trials on each, unless others are requested."""
-
-
-@dataclass(frozen=True)
-class Generalised:
-    """The results that were requested, by name.
-
-    Attributes:
-        made: how many of them were measured now.
-        file: that keeps them.
-    """
-
-    simulated: bool
-    made: int
-    results: dict[str, UnseenScores | NotTrained]
-    file: Path
-
-    def to_json(self) -> Json:
-        """Return plain data for the command line."""
-        results = {name: found.to_json() for name, found in self.results.items()}
-        return {
-            "step": STEP,
-            "simulated": self.simulated,
-            "made": self.made,
-            "results": results,
-            "file": str(self.file),
-        }
 
 
 def measure_generalisation(
@@ -72,7 +44,7 @@ def measure_generalisation(
     skins: int | None = None,
     trials: int = TRIALS,
     epochs: int | None = None,
-) -> Generalised:
+) -> Finding[GeneralisationResults]:
     """Measure what is missing of what is requested.
 
     Args:
@@ -83,7 +55,12 @@ def measure_generalisation(
         trials: on each other skin.
         epochs: of each training, instead of the protocol's.
 
+    Returns:
+        all results that are kept. Named are the file that keeps them, the ``results`` that were
+        requested, and how many of these were ``made`` now; `Finding.more` has both.
+
     Raises:
+        StoreError: a trial has no label yet.
         InputError: no such factor or level, or other skins of a real rig.
     """
     work = Generalisation(store, campaigns, epochs)
@@ -97,9 +74,15 @@ def measure_generalisation(
         tasks += [skin_task(work, model, SKIN_SEEDS + number, trials) for number in range(count)]
     sweep = task_sweep(tasks, work.results)
     made = sweep.run(begin=lambda number, count, task: console.say(f"{task.name} ..."))
-    stored = work.results.load().results if tasks else {}
-    results = {task.name: stored[task.name] for task in tasks}
-    return Generalised(store.simulated, made, results, work.results.path)
+    path = work.results.path
+    stored = (
+        work.results.load()
+        if path.exists()
+        else GeneralisationResults(simulated=store.simulated, results={})
+    )
+    requested = {task.name: stored.results[task.name] for task in tasks}
+    named = {"step": STEP, "made": made, "results": requested, "file": path}
+    return Finding(stored, work.folder, path.stem, more=(requested, path), named=named)
 
 
 def skin_task(work: Generalisation, model: ModelOnDisk, seed: int, trials: int) -> SweepTask:

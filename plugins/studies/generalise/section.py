@@ -12,7 +12,7 @@ from sliplab.analysis.report.plugin_sections import ReportData, ReportSection
 from sliplab.analysis.report.programs import CommandResult
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.windows import share_data
-from sliplab.plugins.studies.document import GeneralisationResults, NotTrained
+from sliplab.plugins.studies.generalise.document import GeneralisationResults, NotTrained
 from sliplab.storage.streams import Json
 
 RESULT = CommandResult("derived/generalisation/results.json", "sliplab generalise {store}")
@@ -42,28 +42,41 @@ def skin_section(
     """
     if found is None:
         return SkinSection(command)
-    groups: dict[str, list[ShareInterval]] = {}
+    results = RESULT.parse(GeneralisationResults, found)
+    columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     rows = []
-    results = RESULT.parse(GeneralisationResults, found).results.items()
-    for name, row in sorted(results, key=lambda each: each[0].startswith("skin ")):
+    for name, row in results.skins_last.items():
         if isinstance(row, NotTrained):
             rows.append([name, row.why, "", "", "", ""])
             continue
-        group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
-        item = ShareInterval(name, row.share, row.low, row.high)
-        groups.setdefault(group, []).append(item)
-        span = "–" if item.low is None else f"{percent(item.low)} to {percent(item.high)}"
+        span = "–" if row.low is None else f"{percent(row.low)} to {percent(row.high)}"
         rows.append(
-            [name, str(row.trials), str(row.n), percent(item.value), span, percent(row.seen)]
+            [name, str(row.trials), str(row.n), percent(row.share), span, percent(row.seen)]
         )
-    figure = None
-    if groups:
-        drawn = [item for of in groups.values() for item in of]
-        line = None if strict is None else (strict, "this network, its own skin")
-        svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
-        figure = Figure(svg, name="skins", data=share_data(drawn))
-    columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
+    figure = unseen_figure(results, strict, simulated=simulated)
     return SkinSection(command, figure, Table(columns, rows), seeds)
+
+
+def unseen_figure(
+    results: GeneralisationResults, strict: float | None = None, *, simulated: bool
+) -> Figure | None:
+    """Draw accuracies on levels left out and on other skins; None where nothing was trained.
+
+    Args:
+        strict: accuracy of the network on its own skin.
+    """
+    groups: dict[str, list[ShareInterval]] = {}
+    for name, row in results.skins_last.items():
+        if not isinstance(row, NotTrained):
+            group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
+            item = ShareInterval(name, row.share, row.low, row.high)
+            groups.setdefault(group, []).append(item)
+    if not groups:
+        return None
+    drawn = [item for of in groups.values() for item in of]
+    line = None if strict is None else (strict, "this network, its own skin")
+    svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
+    return Figure(svg, name="skins", data=share_data(drawn))
 
 
 def _make(data: ReportData) -> SkinSection | None:

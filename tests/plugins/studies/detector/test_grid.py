@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
+from sliplab.plugins.studies.detector.document import DetectorRow
 from sliplab.plugins.studies.detector.grid import (
     PAPER,
     Axes,
@@ -12,7 +15,7 @@ from sliplab.plugins.studies.detector.grid import (
     make_grid,
     strides,
 )
-from sliplab.plugins.studies.detector.rows import DetectorRow, short_list
+from sliplab.plugins.studies.detector.rows import short_list
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import NetworkSettings, Windows
 
@@ -60,21 +63,20 @@ def test_strides_are_multiples_of_the_finest_and_the_length() -> None:
 
 def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
     def row(late: float, early: float, missed: float, work: float, test: float) -> DetectorRow:
-        figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
-        operations = {"synaptic_operations_per_s": [work]}
         return DetectorRow(
-            PAPER,
-            "trained",
-            30,
-            "chosen",
-            4,
-            8.0,
-            False,
-            [0],
-            figures,
-            {"mean_ms": [test]},
-            None,
-            operations,
+            **asdict(PAPER),
+            precision="trained",
+            stride_ms=30,
+            smoothing=4,
+            margin=8.0,
+            paper=False,
+            validation={
+                "mean_ms": (late,),
+                "false_early_either": (early,),
+                "lost_either": (missed,),
+            },
+            test={"mean_ms": (test,)},
+            work={"synaptic_operations_per_s": (work,)},
         )
 
     rows = [

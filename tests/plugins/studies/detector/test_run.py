@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sliplab.analysis.campaigns import Collected, collected
@@ -16,23 +17,20 @@ from sliplab.analysis.detectors.latency import score_trial, summarise_latency, t
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.networks import training
+from sliplab.analysis.study import Finding
 from sliplab.analysis.windows import dataset
 from sliplab.flows.running import console, stopping
+from sliplab.plugins.studies.detector.document import DetectorRow, DetectorTradeoff, mean
 from sliplab.plugins.studies.detector.grid import (
     PAPER,
     Axes,
     NetworkSetting,
     strides,
 )
-from sliplab.plugins.studies.detector.rows import OBJECTIVES, RULES, DetectorRow, mean
-from sliplab.plugins.studies.detector.run import (
-    NUMBERS,
-    PAGE,
-    TABLE,
-    detector_search,
-    tradeoff_detector,
-)
+from sliplab.plugins.studies.detector.rows import OBJECTIVES, RULES
+from sliplab.plugins.studies.detector.run import detector_search, tradeoff_detector
 from sliplab.plugins.studies.detector.search import PRECISIONS, SearchSize, trial_counts
+from sliplab.plugins.studies.detector.study import STUDY
 from sliplab.protocols.settings import Detection
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS as STEP
@@ -69,15 +67,20 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 @pytest.fixture(scope="module")
-def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> tuple[DetectorTradeoff, Path]:
     folder = tmp_path_factory.mktemp("out") / "new"
-    return tradeoff_detector(store, collected(store), folder, SIZE, AXES), folder
+    found = tradeoff_detector(store, collected(store), folder, SIZE, AXES)
+    assert found.named == {"made": 6}
+    assert STUDY.write(found) == folder / "detector_tradeoff.html"
+    return found.result, folder
 
 
-def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> None:
-    found, _ = result
-    assert found["simulated"]
-    assert (found["runs"], found["kept"], found["pending"]) == (6, 6, 0)
+def test_rows_are_of_every_setting_precision_stride_and_rule(
+    result: tuple[DetectorTradeoff, Path],
+) -> None:
+    assert result[0].simulated
+    assert (result[0].runs, result[0].kept, result[0].pending) == (6, 6, 0)
+    found = result[0].to_json()
     keys = ("length_ms", "step_ms", "pool_px", "width", "precision", "stride_ms", "rule")
     rows = {tuple(row[key] for key in keys) for row in found["rows"]}
     expected = set()
@@ -98,9 +101,10 @@ def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> Non
     assert all(lead <= 500 for lead in leads)
 
 
-def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, result: Any) -> None:
-    found, _ = result
-    (paper,) = [row for row in found["rows"] if row["paper"]]
+def test_the_papers_row_is_what_its_rule_gives_on_every_window(
+    store: Store, result: tuple[DetectorTradeoff, Path]
+) -> None:
+    (paper,) = [row for row in result[0].rows if row.paper]
     search = detector_search(store, collected(store), SIZE, AXES)
     run = next(run for run in search.runs if run.setting == PAPER and run.seed == 1)
     fitted = search.fitted(run, lambda share, note: None)
@@ -119,14 +123,13 @@ def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, res
         hits.append(len(counts))
     assert min(hits) > 5
     summary = summarise_latency(scored).incipient
-    assert paper["test"]["mean_ms"][1] == summary.mean
-    assert paper["test"]["missed"][1] == summary.missed / len(scored)
-    assert paper["test"]["false_early"][1] == summary.false_early / len(scored)
+    assert paper.test["mean_ms"][1] == summary.mean
+    assert paper.test["missed"][1] == summary.missed / len(scored)
+    assert paper.test["false_early"][1] == summary.false_early / len(scored)
 
 
-def test_the_front_is_the_definitions(result: Any) -> None:
-    rows = [DetectorRow.of_json(row) for row in result[0]["rows"]]
-    assert [row.as_json() for row in rows] == result[0]["rows"]
+def test_the_front_is_the_definitions(result: tuple[DetectorTradeoff, Path]) -> None:
+    rows = result[0].rows
 
     def costs(row: DetectorRow) -> list[float]:
         values = [(row.objective(name), sign) for name, sign in OBJECTIVES.items()]
@@ -142,24 +145,27 @@ def test_the_front_is_the_definitions(result: Any) -> None:
     assert 0 < sum(row.front for row in rows) < len(rows)
 
 
-def test_page_numbers_and_table_say_the_same(result: Any) -> None:
+def test_page_numbers_and_table_say_the_same(result: tuple[DetectorTradeoff, Path]) -> None:
     found, folder = result
-    assert sorted(item.name for item in folder.iterdir()) == sorted([PAGE, NUMBERS, TABLE])
-    written = json.loads((folder / NUMBERS).read_text())
-    assert {**written, "made": 6} == json.loads(json.dumps(found))
-    page = (folder / PAGE).read_text()
+    names = [f"detector_tradeoff.{kind}" for kind in ("csv", "html", "json")]
+    assert sorted(item.name for item in folder.iterdir()) == [*names, "tables"]
+    assert STUDY.read(folder / names[2]) == found
+    every = pd.read_parquet(folder / "tables" / "detector_tradeoff.rows.parquet")
+    assert list(every["precision"]) == [row.precision for row in found.rows]
+    assert every["simulated"].all()
+    page = (folder / names[1]).read_text()
     assert page.count("<svg") == 2
     assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 7
     assert "★" in page
-    table = list(csv.DictReader(io.StringIO((folder / TABLE).read_text())))
-    assert len(table) == len(found["rows"])
-    for line, row in zip(table, found["rows"], strict=True):
+    table = list(csv.DictReader(io.StringIO((folder / names[0]).read_text())))
+    assert len(table) == len(found.rows)
+    for line, row in zip(table, found.rows, strict=True):
         assert line["simulated"] == "True"
-        assert line["stride_ms"] == str(row["stride_ms"])
-        assert float(line["test_strict_share"]) == mean(row["test"]["strict"])
+        assert line["stride_ms"] == str(row.stride_ms)
+        assert float(line["test_strict_share"]) == mean(row.test["strict"])
         assert float(line["us_single_per_window"]) > 0
-        assert line["front"] == str(row["front"])
-    factors = {item["factor"] for item in found["comparisons"]}
+        assert line["front"] == str(row.front)
+    factors = {item.factor for item in found.comparisons}
     assert factors == {
         "length_ms",
         "step_ms",
@@ -169,27 +175,35 @@ def test_page_numbers_and_table_say_the_same(result: Any) -> None:
         "precision",
         "rule",
     }
-    for item in found["comparisons"]:
-        if item["paper"]:
-            assert item["difference"]["strict"]["mean"] == 0
-    assert sum(item["paper"] for item in found["comparisons"]) == len(factors)
+    for item in found.comparisons:
+        if item.paper:
+            assert item.difference is not None
+            assert item.difference["strict"].mean == 0
+    assert sum(item.paper for item in found.comparisons) == len(factors)
 
 
 def test_a_kept_search_is_not_made_again_and_grows(
-    store: Store, result: Any, tmp_path: Path
+    store: Store, result: tuple[DetectorTradeoff, Path], tmp_path: Path
 ) -> None:
-    plan = tradeoff_detector(store, collected(store), tmp_path / "o", SIZE, AXES, dry_run=True)
-    assert (plan["pending"], plan["estimated_s"]) == (0, 0)
-    assert not (tmp_path / "o").exists()
+    out = tmp_path / "o"
+
+    def tried(size: SearchSize, **how: Any) -> Finding[DetectorTradeoff]:
+        return tradeoff_detector(store, collected(store), out, size, AXES, **how)
+
+    plan = tried(SIZE, dry_run=True)
+    assert plan.dry
+    assert (plan.result.pending, plan.result.estimated_s) == (0, 0)
     more = SearchSize(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
-    plan = tradeoff_detector(store, collected(store), tmp_path / "o", more, AXES, dry_run=True)
-    assert (plan["kept"], plan["pending"]) == (6, 3)
-    assert plan["estimated_s"] > 0
+    grown = tried(more, dry_run=True).result
+    assert (grown.kept, grown.pending) == (6, 3)
+    assert grown.estimated_s is not None
+    assert grown.estimated_s > 0
+    assert not out.exists()
     # other samples are another search beside it
     other = SearchSize(samples=41, epochs=2, trials=2, seeds=1, stride_ms=15)
-    found = tradeoff_detector(store, collected(store), tmp_path / "o", other, AXES, minutes=0)
-    assert (found["kept"], found["rows"]) == (0, [])
-    assert (tmp_path / "o" / PAGE).exists()
+    found = tried(other, minutes=0)
+    assert (found.result.kept, found.result.rows) == (0, ())
+    assert STUDY.write(found).exists()
 
 
 def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
@@ -262,34 +276,14 @@ def test_the_command_names_what_is_wrong_and_knows_its_old_form(
         done = here("tradeoff", *words)
         assert done.returncode == 2, done.stderr
         assert message in done.stderr.replace("\n", " ")
-    done = here(
-        "tradeoff",
-        store.folder,
-        "--dry-run",
-        "--json",
-        "--samples",
-        40,
-        "--epochs",
-        2,
-        "--trials",
-        2,
-        "--seeds",
-        1,
-        "--stride",
-        15,
-        "--length",
-        15,
-        "--length",
-        30,
-        "--step",
-        1,
-        "--pool",
-        20,
-        "--width",
-        0.5,
-        "--width",
-        1,
-    )
+    size = ("--samples", 40, "--epochs", 2, "--trials", 2, "--seeds", 1, "--stride", 15)
+    axes = ("--length", 15, "--length", 30, "--step", 1, "--pool", 20, "--width", 0.5)
+    asked = ("tradeoff", store.folder, "--dry-run", *size, *axes, "--width", 1)
+    done = here(*asked, "--json")
     assert done.returncode == 0, done.stderr
     reported = json.loads(done.stdout)
     assert (reported["runs"], reported["simulated"]) == (3, True)
+    assert not {"page", "rows"} & set(reported)
+    done = here(*asked)
+    assert "tradeoff (simulated)" in done.stdout
+    assert "page" not in done.stderr

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sliplab.analysis.campaigns import collected
@@ -15,8 +16,12 @@ from sliplab.analysis.sweeps.runner import SweepTask, task_sweep
 from sliplab.flows import other_rig
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome
-from sliplab.plugins.studies.document import GeneralisationResults, NotTrained, UnseenScores
 from sliplab.plugins.studies.generalise import results as generalisation
+from sliplab.plugins.studies.generalise.document import (
+    GeneralisationResults,
+    NotTrained,
+    UnseenScores,
+)
 from sliplab.plugins.studies.generalise.results import Generalisation, markdown
 from sliplab.plugins.studies.generalise.run import measure_generalisation, skin_task
 from sliplab.plugins.studies.generalise.section import RESULT
@@ -84,7 +89,7 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
 
 def test_what_is_kept_is_not_measured_again(store: Store) -> None:
     asked = (store, collected(store), ("direction",))
-    assert measure_generalisation(*asked, skins=1, trials=4, epochs=1).made == 0
+    assert measure_generalisation(*asked, skins=1, trials=4, epochs=1).named["made"] == 0
     other = Generalisation(store, collected(store), 2)
     made: list[str] = []
 
@@ -182,10 +187,30 @@ def test_the_command_line(store: Store, tmp_path: Path) -> None:
     done = here("generalise", str(store.folder), *asked, "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
-    assert list(said) == ["step", "simulated", "made", "results", "file"]
-    assert said["results"] == read_json(Path(said["file"]))["results"]
+    assert set(said) == {"page", "step", "simulated", "made", "results", "file"}
+    kept = read_json(Path(said["file"]))
+    assert said["results"] == kept["results"]
+    assert Path(said["page"]).read_text().count("<svg") == 1
+    table = pd.read_parquet(store.folder / "derived/generalisation/tables/results.results.parquet")
+    assert list(table["name"]) == list(kept["results"])
+    assert table["simulated"].all()
     assert (said["simulated"], said["made"]) == (True, 0)
     assert "skin 101" in said["results"]
     shown = here("generalise", str(store.folder), *asked)
     assert "generalise, simulated" in shown.stdout
     assert "skin 101" in shown.stdout
+    fewer = json.loads(
+        here(
+            "generalise", str(store.folder), *asked[:2], "--skins", "0", *asked[6:], "--json"
+        ).stdout
+    )
+    assert "skin 101" not in fewer["results"]
+    assert read_json(Path(said["file"])) == kept
+
+
+def test_missing_label_names_the_trial_and_the_command(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    shutil.rmtree(tmp_path / "store" / "derived" / "labels")
+    done = here("generalise", str(tmp_path / "store"))
+    assert done.returncode == 1
+    assert "has no label yet; run `sliplab label`" in done.stderr

@@ -1,8 +1,4 @@
-"""Results of a store's sweeps: levels left out, and other skins.
-
-Units are those of an evaluation. Every point has the key of what it was made of, so that only what
-is missing or stale is measured.
-"""
+"""Results of levels left out and of other skins; units are those of an evaluation."""
 
 from __future__ import annotations
 
@@ -32,8 +28,17 @@ class NotTrained(Part):
 
 
 class GeneralisationResults(Document):
-    """Results that `sliplab generalise` keeps."""
+    """Results that `sliplab generalise` keeps.
+
+    Every point has the key of what it was made of, so that only what is missing or stale is
+    measured.
+    """
 
     simulated: Bool
     results: dict[str, UnseenScores | NotTrained]
     """By factor and level, such as `speed 4 mm/s`, or by skin, such as `skin 101`."""
+
+    @property
+    def skins_last(self) -> dict[str, UnseenScores | NotTrained]:
+        """The results, other skins after the levels."""
+        return dict(sorted(self.results.items(), key=lambda each: each[0].startswith("skin ")))
