@@ -26,8 +26,8 @@ from sliplab.analysis.force import STREAM as FORCE
 from sliplab.analysis.force import force_figures
 from sliplab.analysis.labels.places import handed_over
 from sliplab.analysis.labels.rest import offsets
-from sliplab.protocols.conditions import Gates
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.gates import Gates
+from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Gate, StreamCounts, StreamRecord, TrialClockMaps

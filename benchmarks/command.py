@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from sliplab.flows.cli import errors
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 
 
 def run_command(app: typer.Typer) -> None:
@@ -20,4 +20,4 @@ def run_command(app: typer.Typer) -> None:
         sys.exit(errors.interruption().report())
     except Exception as error:
         sys.exit(errors.failure(error).report())
-    sys.exit(code if isinstance(code, int) else console.DONE)
+    sys.exit(code if isinstance(code, int) else exit_codes.DONE)

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.shipped import shipped_protocols
 from sliplab.storage.schema.label import KINDS
 from sliplab.storage.streams import EventChunk

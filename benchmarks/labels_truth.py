@@ -32,8 +32,8 @@ from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.scene_runs import MOTION, changed, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.plan import load_plan
-from sliplab.protocols.settings import Labelling
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.mock.fault_settings import MarkerOccluded
 from sliplab.rigs.rig_file import RigFile, load_rig_file

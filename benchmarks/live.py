@@ -19,7 +19,8 @@ from benchmarks.network import gridded
 from benchmarks.slides import slide_events
 from sliplab.analysis.detectors.live import LiveDetector
 from sliplab.analysis.networks.spiking import SpikeEngine
-from sliplab.protocols.settings import Detection, Windows
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.windows import Windows
 
 PACKET_US = 5_000
 HOUR_S = 3600.0

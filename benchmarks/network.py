@@ -38,7 +38,9 @@ from sliplab.analysis.networks.training import fit
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import bin_events, list_events
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import I64, U8, EventChunk
 
 BATCH = 32

@@ -16,7 +16,8 @@ import torch
 from torch import nn
 
 from sliplab.analysis.networks.network import WEIGHTED, build, by_class
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]
 """Currents (n, steps, ...) to spikes of the same shape, from rest."""

@@ -13,6 +13,7 @@ import sys
 import threading
 from contextlib import suppress
 
+from sliplab.flows.running import exit_codes
 from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
 
 END_LIMIT_S = 1.0
@@ -25,7 +26,7 @@ def main() -> None:
     if own:
         _end_on_signals()
     if reason := too_few_threads() or run_in_child():
-        sys.exit(_fail(reason, 1))
+        sys.exit(_fail(reason, exit_codes.FAILED))
     try:
         from sliplab.flows.running.process import OutputLost, collect_garbage_seldom, guarded
 
@@ -34,11 +35,11 @@ def main() -> None:
             with guarded():
                 code = _run()
         except OutputLost as error:  # of output still to be written
-            code = _fail(str(error), 1)
+            code = _fail(str(error), exit_codes.FAILED)
     except KeyboardInterrupt:
-        code = _fail("interrupted", 130)
+        code = _fail("interrupted", exit_codes.INTERRUPTED)
     except (ImportError, MemoryError, OSError, SystemError) as error:
-        code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
+        code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", exit_codes.FAILED)
     if own:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: _end(code))  # all messages are printed
@@ -69,7 +70,8 @@ def _end_on_signals() -> None:
     def end(*_: object) -> None:
         stopping = sys.modules.get("sliplab.flows.running.stopping")
         requested = getattr(stopping, "requested", None)  # it may just be imported
-        _end(130 if requested and requested() else _fail("interrupted", 130))
+        known = requested and requested()
+        _end(exit_codes.INTERRUPTED if known else _fail("interrupted", exit_codes.INTERRUPTED))
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
@@ -87,10 +89,10 @@ def _run() -> int:
             from sliplab.flows.cli.app import command_line
 
             code = command_line(sys.argv[1:])(standalone_mode=False)
-            if code == console.INTERRUPTED:
+            if code == exit_codes.INTERRUPTED:
                 _ignore_signals()
                 return errors.interruption().report()
-            return code if isinstance(code, int) else console.DONE
+            return code if isinstance(code, int) else exit_codes.DONE
         except KeyboardInterrupt:
             _ignore_signals()
             return errors.interruption().report()
@@ -121,7 +123,7 @@ def _explain(error: Exception) -> int:
 
 def _fail(message: str, code: int) -> int:
     """Report in one line an error before or after normal error reporting is available."""
-    stated = message if code == 130 else f"error: {message}"
+    stated = message if code == exit_codes.INTERRUPTED else f"error: {message}"
     with suppress(OSError):
         os.write(2, f"{stated}\n".encode(errors="backslashreplace"))
     console = sys.modules.get("sliplab.flows.running.console")

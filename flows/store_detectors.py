@@ -23,7 +23,7 @@ from sliplab.analysis.networks.models import (
 )
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.shown import one_of
 from sliplab.storage.trials.store import Store, StoreError
 

@@ -17,8 +17,7 @@ from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.motion import check_reference_limits
 from sliplab.protocols.phases import PlateMotion
 from sliplab.protocols.quantity import canonical, check_size
-from sliplab.protocols.settings import Split
-from sliplab.protocols.split import check_split
+from sliplab.protocols.split import Split, check_split
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, raise_all
 
 FULL_TURN = 360

@@ -15,14 +15,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from sliplab.protocols.claims import AdaptiveChoice, Stopping
-from sliplab.protocols.conditions import (
-    Gates,
-    Maintenance,
-    PlateSetup,
-    ProtocolLimits,
-    RecordingSettings,
-    ReferenceSettings,
-)
 from sliplab.protocols.factors import (
     MAX_TRIALS,
     Context,
@@ -31,9 +23,13 @@ from sliplab.protocols.factors import (
     unknown_factor,
     written_units,
 )
+from sliplab.protocols.gates import Gates
+from sliplab.protocols.limits import ProtocolLimits
+from sliplab.protocols.maintenance import Maintenance, ReferenceSettings
 from sliplab.protocols.nuisances import Nuisances
 from sliplab.protocols.phases import Phase
-from sliplab.protocols.quantity import FactorRef
+from sliplab.protocols.quantity import FactorRef, KilogramsOrRef
+from sliplab.protocols.recording import RecordingSettings
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.shown import nearest
 from sliplab.protocols.templates import expand, templates
@@ -93,6 +89,12 @@ def _or_template(schema: dict[str, Any]) -> None:
         for name, template in templates().items()
     ]
     schema["anyOf"] = [phases, *parts]
+
+
+class PlateSetup(StrictModel):
+    """The plate that hangs on the slider in gravity and disturbance trials."""
+
+    mass: KilogramsOrRef
 
 
 class Collection(StrictModel):

@@ -15,10 +15,10 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sliplab.protocols.conditions import Gates
 from sliplab.protocols.consistency import check_consistency
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.factors import Level, in_canonical_unit, unknown_factor
+from sliplab.protocols.gates import Gates
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits, path_fault

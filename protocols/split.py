@@ -10,16 +10,49 @@ trial (docs/decisions/test-trials.md).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
+
+from pydantic import Field, WithJsonSchema
 
 from sliplab.protocols.factors import Factor, Level, unknown_factor
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.quantity import canonical, parse
-from sliplab.protocols.settings import Split
 from sliplab.protocols.shown import did_you_mean
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
 
 GOLDEN = 0.6180339887498949
 _SCALE = float(1 << 63)
+
+HeldOut = Annotated[str, WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}]})]
+"""A level; a number without a unit is in its factor's, see `protocols.model`."""
+
+
+class Split(StrictModel):
+    """Trials that train, choose the model, and test it.
+
+    ``ranked``: repetitions ranked by a hash inside each condition, conditions spread evenly
+    inside the strata. ``leave_conditions_out``: whole levels are held out.
+    """
+
+    method: Literal["ranked", "leave_conditions_out"] = "ranked"
+    train: float = Field(default=0.70, ge=0, le=1)
+    validation: float = Field(default=0.15, ge=0, le=1)
+    test: float = Field(default=0.15, ge=0, le=1)
+    strata: tuple[str, ...] = ("depth", "speed")
+    validation_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
+    test_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
+
+    @rule
+    def _sums(self) -> Split:
+        if abs(self.train + self.validation + self.test - 1.0) > 1e-9:
+            raise KeyedError(
+                "analysis.split",
+                (self.train, self.validation, self.test),
+                "train, validation and test must add up to 1",
+            )
+        if self.method == "leave_conditions_out" and not self.test_levels:
+            raise KeyedError("analysis.split.test_levels", {}, "must list the held-out levels")
+        return self
 
 
 def assign(

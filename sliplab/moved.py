@@ -1,4 +1,4 @@
-"""Names of packages that have moved: code that imports the old ones still works."""
+"""Names of packages and modules that have moved: code that imports the old ones still works."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from types import ModuleType
 MOVED = {
     "sliplab.rigs.testing": "sliplab.plugins.driver_kit",
     "sliplab.analysis.bench": "sliplab.plugins.bench",
+    "sliplab.protocols.conditions": "sliplab.protocols.model",
+    "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }
-"""Old names of packages, and what they are now."""
+"""Old names of packages and modules, and what they are now."""
 
 
 class _Alias(Loader):

@@ -38,7 +38,8 @@ from sliplab.analysis.detectors.onset_references import (
     judge_by_reference,
 )
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.protocols.settings import ComparisonSettings, Detection, Windows
+from sliplab.protocols.detection import ComparisonSettings, Detection
+from sliplab.protocols.windows import Windows
 from sliplab.storage.schema.evaluation import (
     CurvePoint,
     DetectorComparison,

@@ -29,7 +29,8 @@ from sliplab.analysis.detectors.detectors import Predictions, Tuned
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP, winners
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.protocols.settings import Detection, Windows
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 UNDECIDED = "undecided"

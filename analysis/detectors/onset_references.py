@@ -26,7 +26,7 @@ from sliplab.analysis.detectors.latency import (
 from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.labels.label_errors import true_onset_ns
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import OnsetFigures, Rate, TrialLatency, TrialScore
 from sliplab.storage.schema.label import KINDS, Kind, RuleOnsets, TrialLabel
 from sliplab.storage.trials.recording import Recording

@@ -21,7 +21,8 @@ from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Detection, Windows
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived, make_key
 from sliplab.storage.trials.recording import Recording

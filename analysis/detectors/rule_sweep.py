@@ -31,7 +31,7 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.detectors.smoothing_rule import detect, lead_of
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import RuleChoice
 
 I64 = npt.NDArray[np.int64]

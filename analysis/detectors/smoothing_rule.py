@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, winners
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from sliplab.analysis.detectors.predictions import (
 )
 from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing
 from sliplab.analysis.labels.reviewed import StoreLabels
-from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import DetectorComparison, RuleChoice
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError

@@ -28,7 +28,7 @@ from sliplab.analysis.networks.models import (
 )
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.protocols import Trial
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import Evaluation, TrialScore
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording

@@ -38,7 +38,7 @@ from sliplab.analysis.windows.displacement import (
     marker_displacements,
 )
 from sliplab.analysis.windows.sample_sets import TrialRef, by_id
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.evaluation import (
     Evaluation,

@@ -32,9 +32,10 @@ from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
-from sliplab.protocols.settings import Detection, SampleSettings, Windows
+from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.files import read_plain
 from sliplab.storage.schema.evaluation import OtherEvaluation, OtherWindowScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel

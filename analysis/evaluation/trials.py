@@ -29,7 +29,7 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols import Trial
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import (
     AlarmRate,
     ExperimentLatency,

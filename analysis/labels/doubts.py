@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, paper_onsets
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

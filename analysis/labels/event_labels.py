@@ -24,7 +24,7 @@ from sliplab.analysis.labels.event_tracking import (
 )
 from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, last_off_axis, paper_onsets
 from sliplab.analysis.labels.slip_times import SlipTimes
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 

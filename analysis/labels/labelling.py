@@ -28,7 +28,7 @@ from sliplab.analysis.labels.onsets import (
 from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.label import (
     ChangePoints,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 
 NO_ONSET = -1
 """Value in `LabelOnsets.per_marker_ns` of a marker that never slipped."""

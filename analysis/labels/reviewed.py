@@ -12,7 +12,7 @@ from typing import Literal
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels import event_labels, labelling
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import LABELS, OnsetDoubts, TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording

@@ -33,7 +33,8 @@ from sliplab.analysis.networks.network import (
     set_weights,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 from sliplab.protocols.yaml_file import KeyedError, StrictModel, input_error, load, register_tags
 from sliplab.storage.files import read_plain
 

@@ -15,7 +15,9 @@ from pydantic import ValidationError
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import EpochRecord, Fitted, check_classes, restore
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from sliplab.storage.files import MOST_BYTES, read_plain, write_bytes
 
 FORMAT = "sliplab-model-1"

@@ -10,7 +10,9 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
-from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.network_settings import MARGIN
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError

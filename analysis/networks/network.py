@@ -20,7 +20,8 @@ from sinabs.layers import IAFSqueeze
 from torch import nn
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 """Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""

@@ -44,7 +44,9 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.spiking import Samples, SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 
 
 def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:

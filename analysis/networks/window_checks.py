@@ -22,7 +22,9 @@ from sliplab.analysis.networks.network import set_weights
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted, restore
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from sliplab.storage.schema.evaluation import Classification
 
 

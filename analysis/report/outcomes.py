@@ -20,7 +20,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.latency import median_span
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.analysis.report.page import Content, Table, number
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import TrialLatency, TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,

@@ -19,9 +19,10 @@ from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
 from sliplab.analysis.report.programs import HOLDOUT
 from sliplab.analysis.report.sources import Sources
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
-from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import (
     Evaluation,
     OtherEvaluation,

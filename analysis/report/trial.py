@@ -20,7 +20,7 @@ from sliplab.analysis.report.page import Content, Figure
 from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from sliplab.analysis.windows.samples import choose_windows, consecutive_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
-from sliplab.protocols.settings import SampleSettings, Windows
+from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.array_file import Arrays, map_arrays, write_arrays
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP

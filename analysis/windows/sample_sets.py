@@ -16,7 +16,7 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import SampleSettings, Windows
+from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording

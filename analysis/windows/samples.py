@@ -73,7 +73,7 @@ def choose_windows(
         window_ns: a window's length.
         per_class: number of windows of each class.
         seed: of the random windows (PCG64).
-        no_slip: as in `protocols.settings.Samples`.
+        no_slip: as in `protocols.windows.SampleSettings`.
 
     Returns:
         class (0 no slip, 1 incipient, 2 gross) to (n,) int64 starts in ns, ascending, n at most

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 

@@ -17,7 +17,7 @@ from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.samples import consecutive_windows
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.flows.scene_runs import Onsets, SceneRun
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 I64 = npt.NDArray[np.int64]

@@ -16,7 +16,8 @@ from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.flows.scene_runs import Onsets, SceneRun
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import AnalysisSettings, Windows
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import Json
 
 HIGHEST = 3

@@ -10,7 +10,7 @@ import typer
 
 from sliplab.flows.cli.common import FAULTS, finish, new_store, say_faults
 from sliplab.flows.collecting.requests import store_lock
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.adapter import Adapter, load_adapter
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import read_text
@@ -71,7 +71,7 @@ def import_by_adapter(
         failed = "failed" in result
         _finish(result, found, f"imported into {place}", as_json)
         if failed:
-            raise typer.Exit(console.FAILED)
+            raise typer.Exit(exit_codes.FAILED)
 
 
 def _list(found: AdaptedSet, parts: dict[str, str], place: Path, name: str, as_json: bool) -> None:

@@ -17,7 +17,7 @@ from sliplab.flows.cli.common import (
     StoreOption,
     finish,
 )
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
 
 app = typer.Typer()
@@ -90,7 +90,7 @@ def check(
         rows = [[word, it.name, it.finding] for word, it in zip(stated, found, strict=True)]
         console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
     if not all(item.passed for item in found):
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 @app.command(
@@ -165,4 +165,4 @@ def collect(
     shown = {key: value for key, value in result.items() if as_json or key != "causes"}
     finish(shown, f"collected into {store}", as_json)
     if result["missing"] > result["left_out"]:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)

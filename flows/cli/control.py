@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import COLLECT, JsonOption, RigOption, StoreArgument, StoreOption
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _finish(outcomes: list[RequestOutcome], as_json: bool, words: str) -> None:
             f"not yet: the request stays open and is carried out when the trial that runs is over "
             f"({kind}, number {outcomes[0].request.number})"
         )
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 @app.command(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, RigOption
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def detect(
         simulated = " (simulated)" if result["simulated"] else ""
         console.print_pairs(f"detect on {result['rig']}{simulated}", _shown(result))
     if result["interrupted"]:
-        raise typer.Exit(console.INTERRUPTED)
+        raise typer.Exit(exit_codes.INTERRUPTED)
 
 
 def _chosen(

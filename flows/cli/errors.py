@@ -21,7 +21,7 @@ import typer
 from pydantic import ValidationError
 from typer.exceptions import TyperException
 
-from sliplab.flows.running import console, extras
+from sliplab.flows.running import console, exit_codes, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
@@ -34,7 +34,7 @@ _NAMES = {
     errno.EEXIST: "exists already as a file; give a folder or another name",
 }
 """Errors of the system that are those of a given name."""
-INTERRUPTED = "interrupted: every committed trial is kept; run the same command to resume"
+_RESUMABLE = "interrupted: every committed trial is kept; run the same command to resume"
 _WITH_TRIALS = {
     "collect",
     "sync",
@@ -110,15 +110,15 @@ class Failure:
     @property
     def interrupted(self) -> bool:
         """True if the user stopped the program and nothing failed."""
-        return self.exit_code == console.INTERRUPTED
+        return self.exit_code == exit_codes.INTERRUPTED
 
 
 def interruption() -> Failure:
     """Return the failure of a program that the user stopped."""
     text = "interrupted: nothing is left half-written; run the same command again"
     if _command().removeprefix("sliplab ") in _WITH_TRIALS:
-        text = INTERRUPTED
-    return Failure(text, console.INTERRUPTED)
+        text = _RESUMABLE
+    return Failure(text, exit_codes.INTERRUPTED)
 
 
 def is_arm_fault(error: Exception) -> bool:
@@ -133,43 +133,44 @@ def failure(error: Exception) -> Failure:
     if isinstance(error, typer.Abort):
         return interruption()
     if known := exhausted(error):
-        return Failure(known, console.FAILED)
+        return Failure(known, exit_codes.FAILED)
     if isinstance(error, InputError):
         return _wrong_input(error)
     if stated := extras.lacking(error, _command()):
-        return Failure(stated, console.WRONG_INPUT)
+        return Failure(stated, exit_codes.WRONG_INPUT)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
     if isinstance(error, FileNotFoundError | NotADirectoryError) and error.filename:
         place = os.fsdecode(error.filename)
-        return Failure(f"{place}: {os.strerror(error.errno or 0).lower()}", console.FAILED, place)
+        stated = os.strerror(error.errno or 0).lower()
+        return Failure(f"{place}: {stated}", exit_codes.FAILED, place)
     if isinstance(error, OSError) and error.errno in _NAMES:
         place = os.fsdecode(error.filename2 or error.filename or "")
         shown = place if len(place) <= LONGEST_SHOWN else f"{place[:LONGEST_SHOWN]}..."
-        return Failure(f"{shown}: {_NAMES[error.errno]}", console.WRONG_INPUT, shown or None)
+        return Failure(f"{shown}: {_NAMES[error.errno]}", exit_codes.WRONG_INPUT, shown or None)
     if isinstance(error, OSError) and error.filename:
         # of a copy the second file is the one that is written
         place = os.fsdecode(error.filename2 or error.filename)
         error = disk_error(Path(place), error) or error
     elif isinstance(error, OSError) and (fault := disk_fault(error)):
-        return Failure(f"a file cannot be written: its disk {fault}", console.FAILED)
+        return Failure(f"a file cannot be written: its disk {fault}", exit_codes.FAILED)
     if isinstance(error, StoreError):
-        return Failure(str(error), console.FAILED, _place(str(error)))
+        return Failure(str(error), exit_codes.FAILED, _place(str(error)))
     if isinstance(error, UnicodeEncodeError):  # a lone surrogate: a byte that is not UTF-8
         return Failure(
             f"{error.object[:200]!r}: is not UTF-8; rename the file or folder, or correct the text",
-            console.WRONG_INPUT,
+            exit_codes.WRONG_INPUT,
         )
     if _in_prefects_settings(error):
         return Failure(
             f"Prefect's settings cannot be read: {_brief(error)}; check the variables PREFECT_* of "
             "the environment, and .env, prefect.toml and pyproject.toml in this folder",
-            console.WRONG_INPUT,
+            exit_codes.WRONG_INPUT,
         )
     trace = ""
     if type(error).__name__ not in _EXPECTED:
         trace = "".join(traceback.format_exception(error, limit=-8))
-    return Failure(str(error) or type(error).__name__, console.FAILED, trace=trace)
+    return Failure(str(error) or type(error).__name__, exit_codes.FAILED, trace=trace)
 
 
 def _in_prefects_settings(error: Exception) -> bool:
@@ -205,7 +206,7 @@ def _wrong_input(error: InputError) -> Failure:
     file, key = error.file, error.key
     if _OPTION.fullmatch(file):
         file, key = "", f"{file} {key}".strip()
-    code = console.FAILED if isinstance(error, DamagedFile) else console.WRONG_INPUT
+    code = exit_codes.FAILED if isinstance(error, DamagedFile) else exit_codes.WRONG_INPUT
     faults = error.faults if error.more else ()
     return Failure(error.message, code, file or None, key or None, error.value, faults=faults)
 
@@ -226,4 +227,4 @@ def _wrong_usage(error: TyperException) -> Failure:
         message = f"{key} = {value}: {expected}"
     if message:
         message += " (see --help)"
-    return Failure(message, console.WRONG_INPUT, None, key, value)
+    return Failure(message, exit_codes.WRONG_INPUT, None, key, value)

@@ -16,7 +16,7 @@ from sliplab.flows.cli.common import (
     new_store,
     say_faults,
 )
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of
 
@@ -118,4 +118,4 @@ def import_(
             result.pop(key, None)
     finish(result, f"imported into {store}", as_json)
     if failed:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 import typer
 
 from sliplab.flows.cli.common import RIG, JsonOption, RigOption
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def rigs(
         rows = [[str(cell) for name, cell in item.items() if name in COLUMNS] for item in found]
         console.print_table("rigs", [*COLUMNS.values()], rows)
     if any(item["wrong"] for item in found):
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 DRIVER_COLUMNS = {"name": "driver", "kind": "kind", "title": "device", "package": "package"}
@@ -127,7 +127,7 @@ def _list_drivers(as_json: bool) -> None:
         for line in wrong:
             console.say(line)
     if wrong:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 class RigRow(TypedDict):

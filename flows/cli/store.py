@@ -16,7 +16,7 @@ from sliplab.flows.cli.common import (
     StoreArgument,
     located,
 )
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, plural
 
@@ -176,7 +176,7 @@ def verify(
         else:
             console.show(f"{plural(total, 'trial')}, all intact")
     if wrong:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 @app.command(rich_help_panel=DATA, epilog="Example: sliplab migrate my-store")
@@ -349,7 +349,7 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
     else:
         console.show(f"{plural(trials, 'trial')}, all intact")
     if problems:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)
 
 
 def _chosen(store: Store, names: list[str] | None) -> list[Campaign]:
@@ -378,4 +378,4 @@ def _finish(result: dict[str, Any], what: str, as_json: bool) -> None:
         shown["bytes"] = console.size(result["bytes"])
         console.print_pairs(what, {**shown, "left out": len(problems)})
     if problems:
-        raise typer.Exit(console.FAILED)
+        raise typer.Exit(exit_codes.FAILED)

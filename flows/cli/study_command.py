@@ -10,7 +10,7 @@ import typer
 
 from sliplab.analysis.study import Study
 from sliplab.flows.cli.common import JsonOption
-from sliplab.flows.running import console
+from sliplab.flows.running import console, exit_codes
 
 
 def study_app(study: Study[Any]) -> typer.Typer:
@@ -35,7 +35,7 @@ def study_app(study: Study[Any]) -> typer.Typer:
         for name, path in files.items():
             console.say(f"{name}: {path}")
         if found.failed:
-            raise typer.Exit(console.FAILED)
+            raise typer.Exit(exit_codes.FAILED)
 
     own = inspect.signature(study.measure, eval_str=True).parameters.values()
     kind = inspect.Parameter.KEYWORD_ONLY

@@ -10,7 +10,8 @@ from pathlib import Path
 from sliplab.analysis.force import sliding_friction
 from sliplab.analysis.quality import hold_rate
 from sliplab.flows.collecting.requests import CampaignStopped
-from sliplab.flows.planning.estimate import RESERVE, trial_bytes
+from sliplab.flows.planning.disk_space import RESERVE
+from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running.console import size
 from sliplab.protocols import Trial

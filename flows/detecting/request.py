@@ -12,8 +12,9 @@ from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.sink import Timeouts
 from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.program import ACTING, Move, Program
-from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.levels import with_level
 from sliplab.rigs.rig_file import ReflexSettings, RigFile, check_plan, load_rig_file

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-import shutil
-from pathlib import Path
 
-from sliplab.protocols import InputError, Move, Plan, Trial, Twist
+from sliplab.protocols import Move, Plan, Trial, Twist
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import EventStream, FrameStream
 
-RESERVE = 200_000_000
-"""Bytes that must stay free: other programs use the disk, too."""
 TWIST_ARM_MM = 8.0
 """Mean distance of the papillae from the axis of a twist."""
 
@@ -60,24 +56,3 @@ def _frame_bytes(
 def plan_bytes(rig: RigFile, plan: Plan, skip: set[str] | None = None) -> float:
     """Estimate the bytes of all trials except those in `skip`."""
     return sum(trial_bytes(rig, plan, t) for t in plan if not skip or t.id not in skip)
-
-
-def check_space(folder: Path, needed: float) -> int:
-    """Return the free bytes where `folder` is or will be.
-
-    Raises:
-        InputError: `needed` and a reserve do not fit.
-    """
-    there = folder.resolve()
-    while not there.exists():
-        there = there.parent
-    free = shutil.disk_usage(there).free
-    if needed + RESERVE > free:
-        raise InputError(
-            "--store",
-            "",
-            str(folder),
-            f"the plan needs {needed / 1e9:.1f} GB and {RESERVE / 1e9:.1f} GB in reserve, the disk "
-            f"has {free / 1e9:.1f} GB free; free space or choose another folder",
-        )
-    return free

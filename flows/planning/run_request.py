@@ -15,7 +15,8 @@ from sliplab.flows.planning.campaign_trials import (
     excluded_trials,
     pending_trials,
 )
-from sliplab.flows.planning.estimate import check_space, plan_bytes
+from sliplab.flows.planning.disk_space import check_space
+from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences

@@ -34,8 +34,6 @@ from sliplab.flows.running import stopping
 from sliplab.protocols.shown import CONTROL, printable
 from sliplab.storage.errors import masked
 
-DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
-
 LINE_EVERY_S = 60.0
 """Interval between lines of progress where there is no terminal, s: in the log of a long run."""
 

@@ -29,11 +29,11 @@ from sliplab.storage.process import out_of_reach
 from sliplab.storage.remote.mirror import open_for_trial, place_of
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.trial import SyncResult
+from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
-from sliplab.storage.workers import WORKERS, check_work
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

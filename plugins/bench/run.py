@@ -37,8 +37,8 @@ from sliplab.plugins.bench.registry import contents, make_detector
 from sliplab.plugins.bench.scenes import SceneDraw
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import out_of_reach
+from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.workers import WORKERS
 
 ENTRIES_VERSION = 2
 """Incremented when a shipped detector has other figures or intervals on the same scenes."""

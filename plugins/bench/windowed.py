@@ -15,7 +15,7 @@ from sliplab.analysis.windows.samples import choose_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
 from sliplab.plugins.bench.interface import Detector, Evidence, Scene
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 PER_CLASS = 50

@@ -41,9 +41,9 @@ from sliplab.protocols.claims import Stopping, section_hash
 from sliplab.storage.files import write_json
 from sliplab.storage.process import out_of_reach
 from sliplab.storage.schema.campaign_end import CHOICES, STOPPING, Verdict
+from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Campaign, Store
-from sliplab.storage.workers import WORKERS
 
 WAIT_S = 600.0
 """Longest wait for the figures of a trial."""

@@ -15,7 +15,8 @@ from sliplab.analysis.labels.labelling import label_results
 from sliplab.analysis.trial_work import TrialWork
 from sliplab.plugins.claims.document import TrialFigures
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import MARGIN, AnalysisSettings
+from sliplab.protocols.network_settings import MARGIN
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording

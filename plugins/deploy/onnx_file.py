@@ -24,7 +24,7 @@ from sliplab.analysis.networks.network import (
     parameters,
     spike_counts,
 )
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 OPSET = 17
 IR_VERSION = 8

@@ -25,7 +25,8 @@ from sliplab.plugins.deploy.document import (
     PlacedLayer,
     SpeckDescription,
 )
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 KI = 1024
 

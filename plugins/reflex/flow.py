@@ -28,9 +28,9 @@ from sliplab.flows.store_detectors import detectors_of
 from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
 from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
 from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.protocols.settings import Detection
 from sliplab.rigs.build import build_rig, loopback_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig

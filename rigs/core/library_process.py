@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
-from sliplab.storage.workers import refuse_main
+from sliplab.storage.spawn_context import refuse_main
 
 T = TypeVar("T")
 KILL_S = 2.0

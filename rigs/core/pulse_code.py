@@ -31,6 +31,8 @@ SHORTEST_TICKS, LONGEST_TICKS = 2, 9
 """Shortest and longest interval of the code `irregular`."""
 REGULAR_TICKS = 2
 """Interval between the later pulses of the code `regular`."""
+PULSE_NS = 5_000_000
+"""Length of a pulse, at most half a tick, ns; `LONGEST_PULSE` of the firmware (`train.c`)."""
 
 U8 = npt.NDArray[np.uint8]
 _WORD = (1 << 32) - 1

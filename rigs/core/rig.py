@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.protocols.conditions import Rezero
 from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.maintenance import Rezero
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import (

@@ -30,8 +30,8 @@ from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.stream_settings import EventStream, Stream
 from sliplab.storage.process import leave_to_parent, out_of_reach
+from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.streams import FrameChunk, Sink
-from sliplab.storage.workers import WORKERS
 
 READY_S = 180.0
 """Timeout for the fakes to start: kernels may have to be compiled, s."""

@@ -33,7 +33,7 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
-from sliplab.rigs.core.pulse_code import CodeBits
+from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.loopback.arm_path import FakeArmPath
@@ -56,8 +56,6 @@ from sliplab.storage.streams import FrameChunk
 
 REACH_MM = 2_000.0
 """Reach of the fake arm; the driver enforces the rig file's limits."""
-PULSE_NS = 5_000_000
-"""Length of a pulse on the line, as in the firmware at 100 ticks per second."""
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
 """Delay of the world behind the host's clock: longer than a controller's cycle."""

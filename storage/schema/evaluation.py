@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, PlainSerializer
 
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
 Settings = Annotated[Detection, PlainSerializer(lambda settings: settings.model_dump(mode="json"))]

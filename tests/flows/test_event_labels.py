@@ -18,7 +18,7 @@ from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.ui.review import TrialList, load_trial
 from sliplab.flows.ui.review_plots import FramePlot
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import KINDS, TrialLabel
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording

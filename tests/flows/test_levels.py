@@ -61,7 +61,7 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
 
 def label(recording: Recording, data: dict[str, Any]) -> Label:
     """Its label by the rule of its protocol."""
-    from sliplab.protocols.settings import Labelling
+    from sliplab.protocols.labelling import Labelling
 
     return label_recording(recording, Labelling.model_validate(data["analysis"]["labelling"]))
 

@@ -27,7 +27,7 @@ from sliplab.flows.judge_network import judge_model
 from sliplab.flows.report import report
 from sliplab.flows.train import train
 from sliplab.protocols import InputError
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 from tests.analysis.networks.test_external_model import OURS, by_hand, papers

@@ -15,7 +15,7 @@ import pytest
 
 from sliplab.analysis.clocks.synchronise import synchronise_recording
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session, take_all

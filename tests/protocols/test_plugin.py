@@ -122,6 +122,9 @@ def test_names_from_before_a_move_still_work() -> None:
     code = (
         "import sliplab.analysis.bench.interface as old, sliplab.plugins.bench.interface as new;"
         "from sliplab.analysis.bench import registry; import sliplab.plugins.bench.registry as r;"
+        "from sliplab.protocols.conditions import Gates; import sliplab.protocols.gates as g;"
+        "from sliplab.protocols.settings import Detection, Labelling, Split, Training, Windows;"
+        "assert Gates is g.Gates;"
         "print(old is new, registry is r, new.__spec__.name)"
     )
     assert said_by(code).split() == ["True", "True", "sliplab.plugins.bench.interface"]

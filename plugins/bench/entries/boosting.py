@@ -12,7 +12,7 @@ from sliplab.analysis.networks.baselines import features, fitted_trees
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 LEAST = 1e-9
 """Least probability, whose logarithm is finite."""

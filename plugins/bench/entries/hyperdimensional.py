@@ -19,7 +19,7 @@ from sliplab.analysis.networks.baselines import cell_sums
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 BITS = 1024
 PATCHES, LEVELS = 5, 10

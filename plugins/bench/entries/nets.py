@@ -11,7 +11,7 @@ from sliplab.analysis.networks.baseline_nets import fitted_net, net_votes
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 WEIGHT_BYTES = 4
 EPOCHS = 6

@@ -23,7 +23,7 @@ from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.interface import Cost
 from sliplab.plugins.bench.windowed import MeanOdds, WindowDetector
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 DEFAULTS = {"step_ms": 1, "crop_px": 400, "stride_ms": 10, "gain": 1.0}
 BATCH = 64

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.bench.interface import Cost
 from sliplab.plugins.bench.windowed import WindowDetector
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 STRIDE_MS = 10
 SMOOTHED, REMEMBERED = 8, 50

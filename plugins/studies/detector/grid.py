@@ -15,7 +15,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 CHANNELS = ("conv1_channels", "conv2_channels", "hidden")
 

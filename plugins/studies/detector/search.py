@@ -40,13 +40,10 @@ from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.studies.detector.grid import NetworkSetting, SettingGrid, counted_stride
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.settings import (
-    AnalysisSettings,
-    NetworkSettings,
-    SampleSettings,
-    Training,
-    Windows,
-)
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.streams import Json

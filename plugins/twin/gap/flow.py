@@ -29,7 +29,7 @@ from sliplab.plugins.twin.document import TITLES, Behind, GapNetwork, TrainedOn,
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_drawn
 from sliplab.plugins.twin.gap.scores import behind, macro_f1
 from sliplab.protocols import InputError, Plan, load_plan
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import read_rig, rig_path, rig_yaml
 from sliplab.storage.files import make_folder, write_text

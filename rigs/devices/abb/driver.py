@@ -37,32 +37,25 @@ from sliplab.rigs.devices.abb.rws import (
     WebStatus,
     abb_health,
 )
-from sliplab.rigs.devices.abb.settings import AbbSettings
+from sliplab.rigs.devices.abb.settings import (
+    AGREE_MM,
+    FAILURES,
+    FIRST_POSE_S,
+    MONITOR_S,
+    OVERTIME_S,
+    SILENCE_S,
+    STILL_S,
+    STOPPED_S,
+    UNSEEN_STILL_S,
+    AbbSettings,
+)
 from sliplab.rigs.devices.abb.watchdog import Watchdog
 from sliplab.storage.streams import Json
 
 ENTRY, MODULES = "motion_program_main", "motion_program"
 """Task that runs motion programs, and the prefix of its modules' names."""
-MONITOR_S = 0.2
-"""Period at which the state is polled, in four requests, s."""
-FAILURES = 2
-"""Consecutive polls without an answer after which the connection is lost."""
-FIRST_POSE_S = 3.0
-"""Timeout from the start of a motion program to its first EGM pose, s."""
-SILENCE_S = 0.5
-"""Age at which the last pose is stale, s."""
-STOPPED_S = 2.0
-"""Timeout from an accepted stop to the arm at rest, s."""
-STILL_S = 0.2
-"""Time of unchanged poses after which the arm is at rest; longer than between segments, s."""
-UNSEEN_STILL_S = 0.5
-"""The same when only poses are available, because the web services do not answer, s."""
 STATUS_S = MONITOR_S + 2 * STATUS_REQUESTS * REQUEST_S
 """Longest time to the answer of a status poll that has not begun yet, s."""
-OVERTIME_S = 5.0
-"""Time beyond 1.5 times its duration after which a path is stopped, s."""
-AGREE_MM = 0.5
-"""Largest difference between the positions of EGM and the web services, mm."""
 
 
 class AbbArm(ThreadedArm):

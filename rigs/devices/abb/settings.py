@@ -1,4 +1,7 @@
-"""Settings of the ABB driver, as rig files give them; cheap to import."""
+"""Settings of an ABB arm, as rig files give them, and the numbers of its driver.
+
+Cheap to import.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,25 @@ from pydantic import Field
 
 from sliplab.rigs.core.address import BindAddress, Host
 from sliplab.rigs.core.arm_settings import BaseArmSettings, Port
+
+MONITOR_S = 0.2
+"""Period at which the state is polled, in four requests, s."""
+FAILURES = 2
+"""Consecutive polls without an answer after which the connection is lost."""
+FIRST_POSE_S = 3.0
+"""Timeout from the start of a motion program to its first EGM pose, s."""
+SILENCE_S = 0.5
+"""Age at which the last pose is stale, s."""
+STOPPED_S = 2.0
+"""Timeout from an accepted stop to the arm at rest, s."""
+STILL_S = 0.2
+"""Time of unchanged poses after which the arm is at rest; longer than between segments, s."""
+UNSEEN_STILL_S = 0.5
+"""The same when only poses are available, because the web services do not answer, s."""
+OVERTIME_S = 5.0
+"""Time beyond 1.5 times its duration after which a path is stopped, s."""
+AGREE_MM = 0.5
+"""Largest difference between the positions of EGM and the web services, mm."""
 
 
 class AbbSettings(BaseArmSettings):

@@ -28,8 +28,8 @@ from sliplab.rigs.devices.dvxplorer.fake_stream import (
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 from sliplab.storage.process import leave_to_parent, out_of_reach
+from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import I64, EventChunk
-from sliplab.storage.workers import WORKERS, check_work
 
 Packet = tuple[EventChunk, I64]
 """Events, and the rising edges that belong to them, us of the camera's clock."""

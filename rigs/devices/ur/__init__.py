@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING
 
 from sliplab.rigs.core.driver import ArmDriver, ArmScene, ForceSensorDriver
 from sliplab.rigs.core.network import answers, arm_lock
-from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
+from sliplab.rigs.devices.ur.settings import RTDE_PORT, UrSettings, UrWrenchSettings
 
 if TYPE_CHECKING:
     from sliplab.rigs.core.capabilities import Arm, ForceSensor
     from sliplab.rigs.core.fakes import FakeController
-
-RTDE_PORT = 30004
 
 
 def _build(settings: UrSettings) -> Arm:

@@ -23,12 +23,6 @@ from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
 
 START_S = 10.0
 """Timeout for the child to connect, upload the control script and see it running, s."""
-WATCHDOG_HZ = 1.0
-"""Rate of writes below which the controller's watchdog ends the program, and with it any move.
-
-A host that records cameras may delay a process by half a second. A move that continues for another
-second goes no farther than its target, which was checked against all limits.
-"""
 KICK_S = 0.1
 """Period of the writes that keep the watchdog from expiring while nothing else is sent, s."""
 _IDLE_KICK_S = 1.0

@@ -3,7 +3,7 @@
 The driver uses three independent channels to the controller, so that losing one leaves two: the
 pose stream (`rigs.devices.ur.rtde`), the control client ur_rtde in a child process
 (`rigs.devices.ur.control`), and the two text ports (`rigs.devices.ur.ports`). Every wait has a
-timeout, one of the constants below; `docs/arms.md` has measured times.
+timeout, one of the constants of its settings; `docs/arms.md` has measured times.
 
 A segment is one `movel`, from rest to rest. Its start and end are the first controller cycles in
 which the control script reports that the move is running, and that it has ended (bit 15 of
@@ -31,7 +31,7 @@ from sliplab.rigs.core.pose import MM_PER_M, TURN_PER_M, distance_mm, segment_se
 from sliplab.rigs.core.pose_stream import PoseCheck, PoseJumpError, Sample
 from sliplab.rigs.core.threaded_arm import Run, ThreadedArm
 from sliplab.rigs.devices.ur import ports
-from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
+from sliplab.rigs.devices.ur.control import ControlError, ControlProcess
 from sliplab.rigs.devices.ur.rtde import (
     OUTPUTS,
     WRENCH,
@@ -41,43 +41,31 @@ from sliplab.rigs.devices.ur.rtde import (
     UrStatus,
     status_of,
 )
-from sliplab.rigs.devices.ur.settings import UrSettings
+from sliplab.rigs.devices.ur.settings import (
+    ANSWER_S,
+    ARRIVED_MM,
+    BEGIN_S,
+    COMMAND_S,
+    FULL_SPEED,
+    JUMP_S,
+    NEWS_S,
+    OVERTIME_S,
+    PORT_S,
+    REACTION_S,
+    SILENCE_S,
+    STILL_MM_S,
+    STILL_S,
+    STOP_DECELERATION_MM_S2,
+    TURN_DEG_S2,
+    TURN_LATE_S,
+    TURN_SHARE,
+    WATCHDOG_HZ,
+    UrSettings,
+)
 from sliplab.storage.streams import Json
 
-ANSWER_S = 3.0
-"""Timeout to connect the pose stream, including its set-up, s."""
-SILENCE_S = 1.0
-"""Silence after which the pose stream counts as lost, s."""
-COMMAND_S = 2.0
-"""Timeout of one call of the control client; the controller needs a few cycles, s."""
-PORT_S = 1.0
-"""Timeout of one request on a text port, s."""
-BEGIN_S = 1.0
-"""Timeout from an accepted move to the report that it is running, s."""
-OVERTIME_S = 3.0
-"""Time beyond 1.5 times its duration after which a move is stopped, s."""
-STILL_S = 1.0
-"""Timeout from a stop command to the arm at rest, for each channel, s."""
-STOP_DECELERATION_MM_S2 = 1000.0
-"""Deceleration of a stop."""
-REACTION_S = 0.002
-"""Time from a stop to the start of braking: one cycle of the controller, s."""
-ARRIVED_MM = 0.1
-"""A move that ends farther than this from its target was stopped from outside."""
-STILL_MM_S = 0.01
-"""Commanded speed below which the arm is at rest."""
-JUMP_S = 1.0
-"""Step of the controller's clock between two packets above which it has jumped, s."""
-_NEWS_S = 0.1
-"""Timeout for a packet with the new state to arrive, s."""
 _UNKNOWN_NS = 1 << 62
 """Marks a move that is being sent, before the time of its acceptance is known."""
-TURN_DEG_S2 = 50.0
-"""Acceleration of a turn on the spot."""
-TURN_SHARE, TURN_LATE_S = 0.1, 0.1
-"""Deviation of the time that a turn takes: share of it, and s."""
-_FULL_SPEED = 0.999
-"""Position from which the speed slider counts as fully up."""
 
 
 class UrArm(ThreadedArm):
@@ -208,7 +196,7 @@ class UrArm(ThreadedArm):
         Raises:
             ArmFault: a move was sent, and the arm is not confirmed at rest since, neither by its
                 stream nor over a new connection. The controller's watchdog ends the move after
-                1 / `control.WATCHDOG_HZ` s if the network has failed.
+                1 / `settings.WATCHDOG_HZ` s if the network has failed.
         """
         run = self._run
         run.cancelled = True
@@ -302,7 +290,7 @@ class UrArm(ThreadedArm):
         state = self.state()
         if state not in {ArmState.READY, ArmState.NOT_RUNNING}:
             raise self._fault(state, "cannot connect")
-        self._stream.wait_for(lambda: not has_program(), _NEWS_S)
+        self._stream.wait_for(lambda: not has_program(), NEWS_S)
         status = self._status
         assert status is not None
         if status.program:
@@ -381,7 +369,7 @@ class UrArm(ThreadedArm):
                 self._fell_ns = status.t_ns
         self._status = status
         moved_ns = self._moved_ns
-        if moved_ns is not None and packet.host_ns > moved_ns + _NEWS_S * 1e9 and _rests(status):
+        if moved_ns is not None and packet.host_ns > moved_ns + NEWS_S * 1e9 and _rests(status):
             self._rested(moved_ns)
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
         if self.on_wrench is not None:
@@ -405,7 +393,7 @@ class UrArm(ThreadedArm):
         for segment in path:
             if not self._call("isPoseWithinSafetyLimits", to_ur(segment.to)):
                 # The client also answers no once its program has ended.
-                if self._stream.wait_for(lambda: self.state() is not ArmState.READY, _NEWS_S):
+                if self._stream.wait_for(lambda: self.state() is not ArmState.READY, NEWS_S):
                     raise self._fault(self.state(), "cannot move")
                 x, y, z = segment.to.xyz_mm
                 raise RigError(
@@ -417,7 +405,7 @@ class UrArm(ThreadedArm):
     def _check_slider(self, so: str) -> None:
         """Raise ArmFault, with the consequence `so`, if the speed slider slows the arm down."""
         status = self._status
-        if status is not None and status.speed_fraction < _FULL_SPEED:
+        if status is not None and status.speed_fraction < FULL_SPEED:
             raise ArmFault(
                 "arm",
                 f"its speed slider is at {status.speed_fraction:.0%}, so {so}: set it to "
@@ -465,7 +453,7 @@ class UrArm(ThreadedArm):
         """Return start and end of the move that was just sent; None if it was stopped."""
 
         def slowed() -> bool:
-            return self._status is not None and self._status.speed_fraction < _FULL_SPEED
+            return self._status is not None and self._status.speed_fraction < FULL_SPEED
 
         def ended() -> bool:
             over = self._fell_ns is not None or run.cancelled or not self.state().healthy

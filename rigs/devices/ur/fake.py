@@ -37,7 +37,7 @@ from sliplab.rigs.devices.ur.rtde import (
     START,
     TYPES,
 )
-from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
+from sliplab.rigs.devices.ur.settings import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
 _UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
 _INT32 = {"robot_mode", "safety_mode"}
@@ -196,7 +196,6 @@ def _kind(name: str) -> str:
     return _VECTORS.get(name, _UNKNOWN)
 
 
-DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 VERSION = (5, 11, 1, 108318)
 """PolyScope version that it reports."""
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)

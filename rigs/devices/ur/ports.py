@@ -12,8 +12,8 @@ import socket
 
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
 from sliplab.rigs.core.network import BoundedSocket
+from sliplab.rigs.devices.ur.settings import DASHBOARD_PORT, SCRIPT_PORT
 
-DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 HEALTH_S = 1.0
 """Timeout of each dashboard request about the arm's health, s."""
 _LONGEST_LINE = 10_000

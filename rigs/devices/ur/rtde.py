@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sliplab.rigs.core.capabilities import ArmState
+from sliplab.rigs.devices.ur.settings import RTDE_PORT
 
-PORT = 30004
 HEADER = struct.Struct(">HB")
 TYPES = {"DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6D": "6d"}
 """Format characters of `struct` by the RTDE names of the types used here."""
@@ -78,7 +78,7 @@ class RtdeReader:
         """
         deadline = time.monotonic() + self._answer_s
         try:
-            self._socket = socket.create_connection((self._host, PORT), self._answer_s)
+            self._socket = socket.create_connection((self._host, RTDE_PORT), self._answer_s)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             body = self._ask(REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2), deadline)
             if body != b"\x01":
@@ -95,7 +95,7 @@ class RtdeReader:
                 raise RtdeError("the controller did not start the stream")
         except (OSError, struct.error, ValueError, IndexError) as error:
             self.close()
-            raise RtdeError(f"cannot read from {self._host}:{PORT}: {error}") from None
+            raise RtdeError(f"cannot read from {self._host}:{RTDE_PORT}: {error}") from None
         except RtdeError:
             self.close()
             raise

@@ -1,4 +1,7 @@
-"""Settings of a Universal Robots arm, as rig files give them; cheap to import."""
+"""Settings of a Universal Robots arm, as rig files give them, and the numbers of its driver.
+
+Cheap to import.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,46 @@ from pydantic import Field
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings, Positive
 from sliplab.rigs.core.device_settings import DriverSettings
+
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
+ANSWER_S = 3.0
+"""Timeout to connect the pose stream, including its set-up, s."""
+SILENCE_S = 1.0
+"""Silence after which the pose stream counts as lost, s."""
+COMMAND_S = 2.0
+"""Timeout of one call of the control client; the controller needs a few cycles, s."""
+PORT_S = 1.0
+"""Timeout of one request on a text port, s."""
+BEGIN_S = 1.0
+"""Timeout from an accepted move to the report that it is running, s."""
+OVERTIME_S = 3.0
+"""Time beyond 1.5 times its duration after which a move is stopped, s."""
+STILL_S = 1.0
+"""Timeout from a stop command to the arm at rest, for each channel, s."""
+STOP_DECELERATION_MM_S2 = 1000.0
+"""Deceleration of a stop."""
+REACTION_S = 0.002
+"""Time from a stop to the start of braking: one cycle of the controller, s."""
+ARRIVED_MM = 0.1
+"""A move that ends farther than this from its target was stopped from outside."""
+STILL_MM_S = 0.01
+"""Commanded speed below which the arm is at rest."""
+JUMP_S = 1.0
+"""Step of the controller's clock between two packets above which it has jumped, s."""
+NEWS_S = 0.1
+"""Timeout for a packet with the new state to arrive, s."""
+TURN_DEG_S2 = 50.0
+"""Acceleration of a turn on the spot."""
+TURN_SHARE, TURN_LATE_S = 0.1, 0.1
+"""Deviation of the time that a turn takes: share of it, and s."""
+FULL_SPEED = 0.999
+"""Position from which the speed slider counts as fully up."""
+WATCHDOG_HZ = 1.0
+"""Rate of writes below which the controller's watchdog ends the program, and with it any move.
+
+A host that records cameras may delay a process by half a second. A move that continues for another
+second goes no farther than its target, which was checked against all limits.
+"""
 
 
 class UrSettings(BaseArmSettings):

@@ -15,7 +15,7 @@ from sliplab.analysis.detectors.detector_comparison import (
 from sliplab.analysis.detectors.detectors import Levels, WindowEvidence
 from sliplab.analysis.detectors.latency import TrialLatency, TrueSlip
 from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing, settled
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 
 MS = 1_000_000
 EARLY = 30 * MS

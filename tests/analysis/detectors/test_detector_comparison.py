@@ -13,7 +13,8 @@ from sliplab.analysis.detectors.detector_comparison import Parts, compare, thinn
 from sliplab.analysis.detectors.detectors import Predictions, TrialWithSlip
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import OnsetReference, References
-from sliplab.protocols.settings import ComparisonSettings, Detection, Windows
+from sliplab.protocols.detection import ComparisonSettings, Detection
+from sliplab.protocols.windows import Windows
 from sliplab.storage.schema.evaluation import DetectorComparison, PartTrials
 
 MS = 1_000_000

@@ -17,7 +17,7 @@ from sliplab.analysis.detectors.detectors import (
 )
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import detect
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 
 MS = 1_000_000
 LENGTH = 30 * MS

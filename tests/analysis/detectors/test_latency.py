@@ -16,7 +16,7 @@ from sliplab.analysis.detectors.latency import (
     true_slip,
 )
 from sliplab.analysis.detectors.smoothing_rule import Detections, detect
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.label import TrialLabel
 
 MS = 1_000_000

@@ -24,7 +24,8 @@ from sliplab.analysis.detectors.live import FreshestArrival, LiveDecision, LiveD
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.protocols.settings import Detection, Windows
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 TINY = Windows(length_ms=4, step_ms=1, crop_px=40, pool_px=20, polarity="both")

@@ -15,7 +15,7 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, choose_pair, score, sweep
 from sliplab.analysis.detectors.smoothing_rule import detect
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 
 MS = 1_000_000
 SMOOTHINGS, MARGINS = (1, 2, 5), (0.0, 0.5, 1.0, 3.0)

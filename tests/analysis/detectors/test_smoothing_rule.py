@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplab.analysis.detectors.smoothing_rule import detect
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 
 MS = 1_000_000
 N, I, G, Q = (9, 0, 0), (0, 9, 0), (0, 0, 9), (0, 0, 0)  # noqa: E741

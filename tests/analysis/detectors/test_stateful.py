@@ -18,7 +18,8 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 WINDOWS = Windows(length_ms=6, crop_px=160)
 NETWORK = NetworkSettings(conv1_channels=2, conv2_channels=3, hidden=6, weight_scale=(6, 5, 6, 6))

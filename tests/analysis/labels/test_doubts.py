@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, doubts, uncertain
 from sliplab.analysis.labels.onsets import paper_onsets
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 
 FRAME_NS = 10_000_000
 RULE = Labelling(threshold_px=2.0)

@@ -11,7 +11,7 @@ import pytest
 from sliplab.analysis.labels.labelling import Label, label_places
 from sliplab.analysis.labels.places import Places
 from sliplab.analysis.labels.plate_tracking import PlateTrack
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 
 FRAME_NS = 10_000_000
 START = 200

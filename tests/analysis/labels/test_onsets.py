@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.onsets import displacements, paper_onsets, rest_time
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 
 MS = 1_000_000
 T0 = 2**62

@@ -19,7 +19,7 @@ from sliplab.analysis.networks.external_model import Description, load_external
 from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.protocols import InputError
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from tests.conftest import ROOT
 

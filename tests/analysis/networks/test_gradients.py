@@ -26,7 +26,9 @@ from sliplab.analysis.networks.network import build, by_parameter, matrices, on_
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted, fit
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

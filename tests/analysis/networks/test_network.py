@@ -10,7 +10,8 @@ from sinabs.utils import validate_memory_mapping_speck
 
 from sliplab.analysis.networks import network
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED, build, spike_counts, weights
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -184,7 +185,8 @@ def test_the_chip_vendors_package_is_never_imported() -> None:
         "import sliplab.analysis.detectors.live, sliplab.plugins.deploy.onnx_file\n"
         "import sliplab.analysis.networks.quantised, sliplab.analysis.networks.training\n"
         "from sliplab.analysis.networks.network import build\n"
-        "from sliplab.protocols.settings import NetworkSettings, Windows\n"
+        "from sliplab.protocols.network_settings import NetworkSettings\n"
+        "from sliplab.protocols.windows import Windows\n"
         "build(NetworkSettings(), Windows(), 0)\n"
         "bad = [m for m in sys.modules if m.split('.')[0] == 'samna' or 'dynapcnn' in m]\n"
         "assert not bad, bad\n"

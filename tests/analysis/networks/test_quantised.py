@@ -10,7 +10,9 @@ from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.quantised import chip_run, common_net, common_threshold, quantise
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 
 WINDOWS = Windows(length_ms=12, crop_px=140)
 

@@ -25,7 +25,8 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -22,7 +22,8 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.spiking import GradientJob, Trainer, WindowLoss
 from sliplab.analysis.networks.spiking_gradients import _through
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 from tests.analysis.networks import test_spiking
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, gridded, sparse
 

@@ -19,7 +19,9 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.synaptic import count_work, reached
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 
 WINDOWS = Windows(length_ms=8, crop_px=140, polarity="both")  # (8, 2, 7, 7): an odd side
 

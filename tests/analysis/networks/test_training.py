@@ -33,7 +33,9 @@ from sliplab.analysis.networks.training import (
     restore,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -9,7 +9,9 @@ from sliplab.analysis.networks import window_checks
 from sliplab.analysis.networks.training import Fitted, fit
 from sliplab.analysis.networks.window_checks import CheckFailed, check_chance, check_permutations
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from sliplab.storage.schema.evaluation import Classification
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -14,7 +14,7 @@ from sliplab.analysis.report.latency import smallest_lead
 from sliplab.analysis.report.outcomes import trial_intervals
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.tiles import slip_tiles
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema import evaluation
 from sliplab.storage.schema.evaluation import Accuracy, AlarmRate, Seeds, SeedScores, TrialLatency
 from sliplab.storage.schema.summary import (

@@ -16,7 +16,7 @@ from sliplab.analysis.evaluation.trials import summaries
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification, window_groups
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.schema import evaluation
 from sliplab.storage.schema.evaluation import (
     ChangePointCoverage,

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import bin_events, list_events
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 dense = hnp.arrays(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sliplab.analysis.windows.windows import bin_events, first_pixel, list_events, window_totals
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 PAPER = Windows()

@@ -22,7 +22,7 @@ from benchmarks.scene_tradeoff.error import (
     tensor_l1,
 )
 from benchmarks.scene_tradeoff.windows import look, pooled
-from sliplab.protocols.settings import SampleSettings, Windows
+from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.streams import EventChunk
 
 WINDOWS = Windows()

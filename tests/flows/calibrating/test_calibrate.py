@@ -18,7 +18,7 @@ from sliplab.analysis.calibration.charuco import Board, find_corners
 from sliplab.flows import __main__ as entry
 from sliplab.flows.calibrating import calibrate, measurement, teach
 from sliplab.flows.calibrating.calibrate import PNG_PX_PER_MM, print_board
-from sliplab.flows.running import console, stopping
+from sliplab.flows.running import exit_codes, stopping
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Position
 from sliplab.rigs.build import build_rig, taught_frame
@@ -319,7 +319,7 @@ def test_wrong_input_is_exit_2_and_moves_nothing(
     moved: list[object] = []
     monkeypatch.setattr(teach, "touch", lambda *_: moved.append(1))
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    assert run(*(places.get(str(a), a) for a in arguments)) == console.WRONG_INPUT
+    assert run(*(places.get(str(a), a) for a in arguments)) == exit_codes.WRONG_INPUT
     said = capsys.readouterr()
     assert says in " ".join(said.err.split())
     assert said.out == ""
@@ -362,7 +362,7 @@ def test_a_failed_measurement_is_exit_1_and_writes_nothing(
 ) -> None:
     path = lab(tmp_path, **changes)
     before = path.read_text()
-    assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
+    assert run("teach", "plane", "--rig", path, "--yes") == exit_codes.FAILED
     assert says in " ".join(capsys.readouterr().err.split())
     assert path.read_text() == before
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
@@ -382,7 +382,7 @@ def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
 
     monkeypatch.setattr("sliplab.rigs.build.build_rig", built)
     monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
-    assert run("teach", "plane", "--rig", path, "--yes") == console.INTERRUPTED
+    assert run("teach", "plane", "--rig", path, "--yes") == exit_codes.INTERRUPTED
     said = capsys.readouterr().err
     assert "the arm is at rest, nothing was written" in said
     (rig,) = rigs
@@ -399,7 +399,7 @@ def test_a_person_who_says_stop_ends_it(
 
     monkeypatch.setattr(teach, "jog_poses", stops)
     path = lab(tmp_path)
-    assert run("teach", "tool", "--rig", path, "--yes") == console.INTERRUPTED
+    assert run("teach", "tool", "--rig", path, "--yes") == exit_codes.INTERRUPTED
     assert "stopped" in capsys.readouterr().err
 
 
@@ -418,7 +418,7 @@ def test_the_arm_is_asked_for_before_it_moves(
 
     monkeypatch.setattr("sys.stdin", Terminal())
     monkeypatch.setattr(measurement.typer, "confirm", answer)
-    assert run("teach", "zero", "--rig", lab(tmp_path)) == console.INTERRUPTED
+    assert run("teach", "zero", "--rig", lab(tmp_path)) == exit_codes.INTERRUPTED
     assert "Move the arm?" in asked[0]
 
 

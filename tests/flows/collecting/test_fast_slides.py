@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import tiny
 

@@ -14,7 +14,7 @@ from typing import Any
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.fault_settings import KINDS

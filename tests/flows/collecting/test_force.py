@@ -23,7 +23,7 @@ from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.ui import view
 from sliplab.protocols import InputError, Protocol, make_plan
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError

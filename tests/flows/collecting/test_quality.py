@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.analysis.quality import BURST_US, _event_burst
-from sliplab.protocols.settings import Labelling
+from sliplab.protocols.labelling import Labelling
 from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session
 from tests.flows.conftest import tiny_gravity

@@ -14,7 +14,8 @@ from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.planning.estimate import RESERVE, trial_bytes
+from sliplab.flows.planning.disk_space import RESERVE
+from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols import InputError, load_plan
 from sliplab.storage.trials import control

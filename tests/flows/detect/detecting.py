@@ -14,7 +14,9 @@ from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile

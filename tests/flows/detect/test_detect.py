@@ -20,7 +20,7 @@ from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig

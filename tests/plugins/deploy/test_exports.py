@@ -31,7 +31,9 @@ from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
 from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
 from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.plugins.deploy.speck import CORES, KI, speck_fit
-from sliplab.protocols.settings import NetworkSettings, Training, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.training import Training
+from sliplab.protocols.windows import Windows
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -19,7 +19,7 @@ from sliplab.plugins.reflex import flow
 from sliplab.plugins.reflex.rows import reflex_rows
 from sliplab.plugins.reflex.study import STUDY
 from sliplab.protocols import InputError
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write

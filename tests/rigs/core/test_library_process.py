@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
-from sliplab.storage.workers import MainModuleError
+from sliplab.storage.spawn_context import MainModuleError
 
 HERE = "tests.rigs.core.test_library_process"
 

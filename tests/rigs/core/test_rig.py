@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sliplab.protocols import Plan, Protocol, load_plan, make_plan
-from sliplab.protocols.conditions import Rezero
+from sliplab.protocols.maintenance import Rezero
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError

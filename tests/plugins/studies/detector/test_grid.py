@@ -17,7 +17,8 @@ from sliplab.plugins.studies.detector.grid import (
 )
 from sliplab.plugins.studies.detector.rows import short_list
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import NetworkSettings, Windows
+from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.windows import Windows
 
 
 def test_lines_and_the_small_cross_are_tried_once_each() -> None:

@@ -31,7 +31,7 @@ from sliplab.plugins.studies.detector.rows import OBJECTIVES, RULES
 from sliplab.plugins.studies.detector.run import detector_search, tradeoff_detector
 from sliplab.plugins.studies.detector.search import PRECISIONS, SearchSize, trial_counts
 from sliplab.plugins.studies.detector.study import STUDY
-from sliplab.protocols.settings import Detection
+from sliplab.protocols.detection import Detection
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived

@@ -9,7 +9,7 @@ from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.analysis.metrics import classification
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.plugins.twin.gap.scores import behind, macro_f1
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.windows import Windows
 
 Y = np.array([0, 1, 2, 0, 1, 2])
 

@@ -17,7 +17,7 @@ from sliplab.rigs.core.guard import WorkspaceError
 from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices import abb
-from sliplab.rigs.devices.abb import driver
+from sliplab.rigs.devices.abb import settings
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.rws import REQUEST_S, START_REQUESTS
 from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings, reconnect
@@ -103,7 +103,7 @@ def test_a_path_of_segments_is_followed_from_rest_to_rest(abb_pair: MakeAbb) -> 
 
 def test_egm_that_tells_the_flange_is_noticed_and_may_be_set(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair(connected=False, egm_point="flange")
-    fails(arm.connect, driver.FIRST_POSE_S, r"120\.0 mm apart: set `egm_point`")
+    fails(arm.connect, settings.FIRST_POSE_S, r"120\.0 mm apart: set `egm_point`")
     right = AbbArm(abb_settings(robot.host, egm_point="flange"))
     try:
         right.connect()
@@ -162,7 +162,7 @@ def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(abb_pair: Any, 
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
     robot.inject(kind)
-    lost_s = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S)
+    lost_s = settings.FAILURES * (settings.MONITOR_S + 2 * REQUEST_S)
     fails(arm.stop, 4 * REQUEST_S, "cannot be reached to stop it")
     until(lambda: arm.state() is ArmState.DISCONNECTED, lost_s + BUSY_S)
     assert arm.progress().done
@@ -183,7 +183,7 @@ def test_a_link_lost_while_connecting_or_uploading(abb_pair: Any, kind: Kind, st
 def test_a_link_lost_while_idle(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     robot.inject(Kind.LINK_CUT)
-    lost_s = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S)
+    lost_s = settings.FAILURES * (settings.MONITOR_S + 2 * REQUEST_S)
     until(lambda: arm.state() is ArmState.DISCONNECTED, lost_s + BUSY_S)
     fails(lambda: arm.start(SLIDE), REQUEST_S, "check power and network")
     arm.stop()
@@ -196,7 +196,7 @@ def test_an_address_where_nothing_listens_is_a_fault() -> None:
 
 def test_poses_that_do_not_come_are_a_fault(abb_pair: MakeAbb) -> None:
     arm, _ = abb_pair(connected=False, arm={"egm_port": EGM_PORT + 1})
-    fails(arm.connect, driver.FIRST_POSE_S + 7 * REQUEST_S, "no pose came on UDP port 6511")
+    fails(arm.connect, settings.FIRST_POSE_S + 7 * REQUEST_S, "no pose came on UDP port 6511")
 
 
 def test_a_second_client_is_refused(abb_pair: MakeAbb) -> None:

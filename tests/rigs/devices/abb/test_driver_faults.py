@@ -16,7 +16,7 @@ from abb_robot_client._egm_protobuf import egm_pb2
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
 from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Kind
 from sliplab.rigs.core.pose import distance_mm
-from sliplab.rigs.devices.abb import driver
+from sliplab.rigs.devices.abb import driver, settings
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.rws import REQUEST_S, WebRefused, WebServices
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.realtime
 
 BUSY_S = 3.0
 FAR = Pose((9999.0, 9999.0, 9999.0), HOME.rotvec_deg)
-LOST_S = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S) + BUSY_S
+LOST_S = settings.FAILURES * (settings.MONITOR_S + 2 * REQUEST_S) + BUSY_S
 
 
 def at(y_mm: float) -> Pose:
@@ -125,7 +125,7 @@ def test_a_path_thread_that_fails_says_so_and_stops_the_arm(
     monkeypatch.setattr(arm, "_abort_reason", lambda: 1 / 0)
     until(lambda: arm._run.done, BUSY_S)
     fails(arm.progress, 0.0, "its path was aborted: ZeroDivisionError")
-    until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
+    until(lambda: not robot.moving(), settings.STOPPED_S + BUSY_S)
 
 
 def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
@@ -167,7 +167,7 @@ def test_stop_does_not_wait_for_a_path_that_is_being_sent(abb_pair: MakeAbb) -> 
     until(lambda: arm._may_move, 10 * REQUEST_S)
     began = time.monotonic()
     arm.stop()
-    assert time.monotonic() - began < 6 * REQUEST_S + driver.STOPPED_S + BUSY_S
+    assert time.monotonic() - began < 6 * REQUEST_S + settings.STOPPED_S + BUSY_S
     starting.join(25 * REQUEST_S)
     assert not starting.is_alive()
     assert arm.state() is ArmState.READY
@@ -189,8 +189,8 @@ threading.Event().wait()
 
 def test_the_controller_stops_the_arm_when_the_program_is_killed(abb_pair: MakeAbb) -> None:
     _, robot = abb_pair(connected=False)
-    settings = abb_settings(robot.host).model_dump_json()
-    gone_mm = mm_after_kill(KILLED, settings, robot, 2.0 + BUSY_S)
+    arm_settings = abb_settings(robot.host).model_dump_json()
+    gone_mm = mm_after_kill(KILLED, arm_settings, robot, 2.0 + BUSY_S)
     assert robot.watchdog_stops == 1
     assert 40.0 * 0.5 < gone_mm < 40.0 * 1.3
 
@@ -248,22 +248,22 @@ def test_packets_of_other_senders_are_not_believed(abb_pair: MakeAbb) -> None:
 def test_poses_that_stay_away_in_mid_motion_stop_the_arm(abb_pair: MakeAbb) -> None:
     arm, robot = sliding(*abb_pair())
     robot.egm_on = False
-    until(lambda: arm._run.done, driver.SILENCE_S + BUSY_S)
+    until(lambda: arm._run.done, settings.SILENCE_S + BUSY_S)
     fails(arm.progress, 0.0, "sent no pose for 0.* s while it moved")
-    until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
+    until(lambda: not robot.moving(), settings.STOPPED_S + BUSY_S)
     assert robot.pose().xyz_mm[1] < 14.0
 
 
 def test_packets_without_time_are_refused(abb_pair: MakeAbb) -> None:
     arm, _ = abb_pair(connected=False, egm_time=False)
-    fails(arm.connect, driver.FIRST_POSE_S, "carry no time.*RobotWare 6.07 or newer is needed")
+    fails(arm.connect, settings.FIRST_POSE_S, "carry no time.*RobotWare 6.07 or newer is needed")
 
 
 def test_a_clock_that_falls_back_ends_the_path(abb_pair: MakeAbb) -> None:
     arm, robot = sliding(*abb_pair())
     robot.inject(Kind.CLOCK_BACK)
     until(lambda: arm.state() is ArmState.DISCONNECTED, BUSY_S)
-    until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
+    until(lambda: not robot.moving(), settings.STOPPED_S + BUSY_S)
     until(lambda: arm._run.done, BUSY_S)
     fails(arm.progress, 0.0, r"clock jumped back by .* its path was aborted")
     fails(lambda: arm.start(SLIDE), 0.0, r"clock jumped back by (4\.9|5\.0)\d+ s")
@@ -294,7 +294,7 @@ def test_a_speed_ratio_changed_in_mid_motion_stops_the_arm(abb_pair: MakeAbb) ->
     robot.speed_percent = 25.0
     until(lambda: arm._run.done, driver.STATUS_S + BUSY_S)
     fails(arm.progress, 0.0, "speed ratio set to 25 % while it moved")
-    until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
+    until(lambda: not robot.moving(), settings.STOPPED_S + BUSY_S)
 
 
 def test_a_program_of_somebody_else_is_neither_run_nor_ended(abb_pair: MakeAbb) -> None:

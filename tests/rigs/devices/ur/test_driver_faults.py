@@ -23,13 +23,13 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
 from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Fault, Kind, Stage
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.ur import control as ur_control
-from sliplab.rigs.devices.ur import driver
 from sliplab.rigs.devices.ur import ports as ur_ports
+from sliplab.rigs.devices.ur import settings
 from sliplab.rigs.devices.ur.control import ControlError, ControlProcess
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.fake_program import Safety
 from sliplab.rigs.devices.ur.rtde import HEADER, SETUP_INPUTS
-from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
+from sliplab.rigs.devices.ur.settings import RTDE_PORT
 from tests.rigs.devices.conftest import MakeArm, MakeRobot, MakeUr, reconnect, ur_settings
 from tests.rigs.waiting import own_address, until
 
@@ -105,10 +105,10 @@ def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
     arm, robot = ur_pair(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] >= 1.0, 5.0)
-    until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
-    until(lambda: arm.progress().done, 2 * driver.PORT_S + BUSY_S)
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
-    until(lambda: not robot.moving(), 1 / ur_control.WATCHDOG_HZ + BUSY_S)  # its own watchdog
+    until(lambda: arm.state() is ArmState.DISCONNECTED, settings.SILENCE_S + BUSY_S)
+    until(lambda: arm.progress().done, 2 * settings.PORT_S + BUSY_S)
+    fails(arm.stop, 2 * settings.PORT_S, "cannot be reached to stop it")
+    until(lambda: not robot.moving(), 1 / settings.WATCHDOG_HZ + BUSY_S)  # its own watchdog
     where = robot.pose()
     robot.restore_link()
     reconnect(arm)
@@ -119,11 +119,11 @@ def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
 def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
     arm, robot = ur_pair()
     robot.inject(kind)
-    until(lambda: arm.state() is ArmState.DISCONNECTED, driver.SILENCE_S + BUSY_S)
-    fails(lambda: arm.start(SLIDE), driver.PORT_S, "does not answer")
+    until(lambda: arm.state() is ArmState.DISCONNECTED, settings.SILENCE_S + BUSY_S)
+    fails(lambda: arm.start(SLIDE), settings.PORT_S, "does not answer")
     arm.stop()  # an arm that stood still needs no stopping
     robot.restore_link()
-    until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
+    until(lambda: not robot.program.program_running, 1 / settings.WATCHDOG_HZ + BUSY_S)
     reconnect(arm)
 
 
@@ -131,7 +131,7 @@ def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
 @pytest.mark.parametrize(
     ("stage", "within_s"),
     [
-        (Stage.CONNECTING, driver.ANSWER_S),
+        (Stage.CONNECTING, settings.ANSWER_S),
         (Stage.CONTROL, ur_control.START_S),
         (Stage.UPLOADING, ur_control.START_S),
     ],
@@ -146,12 +146,12 @@ def test_a_link_lost_while_connecting_or_uploading(
     """The client would wait for ever in most of these; the child's bound is cut short here."""
     monkeypatch.setattr(ur_control, "START_S", 2.0)
     arm, robot = ur_pair(connected=False, faults=[Fault(kind, stage)])
-    fails(arm.connect, min(within_s, 2.0) + 2 * driver.PORT_S, "its power|did not give control")
+    fails(arm.connect, min(within_s, 2.0) + 2 * settings.PORT_S, "its power|did not give control")
     assert arm.state() is ArmState.DISCONNECTED
     robot.restore_link()
     monkeypatch.undo()
     if robot.program.program_running:  # the script came through: a person ends it at the pendant
-        fails(arm.connect, driver.ANSWER_S, "a program is already running on it")
+        fails(arm.connect, settings.ANSWER_S, "a program is already running on it")
         robot.inject(Kind.PROGRAM_END)
     reconnect(arm)
 
@@ -160,8 +160,10 @@ def test_a_controller_that_takes_commands_and_never_answers(ur_pair: MakeUr) -> 
     """Its stream flows and its program says that it runs, but nothing happens any more."""
     arm, robot = ur_pair()
     robot.hang_program(True)
-    took = fails(lambda: arm.start(SLIDE), driver.COMMAND_S + 2 * driver.PORT_S, "lost its control")
-    assert took >= driver.COMMAND_S
+    took = fails(
+        lambda: arm.start(SLIDE), settings.COMMAND_S + 2 * settings.PORT_S, "lost its control"
+    )
+    assert took >= settings.COMMAND_S
     assert not robot.program.program_running  # it was asked to stop by the dashboard
     robot.hang_program(False)
     reconnect(arm)
@@ -172,18 +174,18 @@ def test_a_dead_control_client_leaves_two_ways_to_stop(ur_pair: MakeUr) -> None:
     arm._control.kill()
     began = time.monotonic()
     arm.stop()
-    assert time.monotonic() - began < 2 * driver.PORT_S + driver.STILL_S + BUSY_S
+    assert time.monotonic() - began < 2 * settings.PORT_S + settings.STILL_S + BUSY_S
     assert not robot.moving()
 
 
 def test_remote_control_off_is_a_state_of_its_own(ur_pair: MakeUr) -> None:
     arm, robot = ur_pair(connected=False)
     robot.set_remote(False)
-    fails(arm.connect, driver.ANSWER_S, "remote control off; switch the pendant")
+    fails(arm.connect, settings.ANSWER_S, "remote control off; switch the pendant")
     robot.set_remote(True)
     arm.connect()
     robot.set_remote(False)
-    fails(lambda: arm.start(SLIDE), driver.PORT_S, "switch the pendant to remote control")
+    fails(lambda: arm.start(SLIDE), settings.PORT_S, "switch the pendant to remote control")
     assert arm.state() is ArmState.REMOTE_CONTROL_OFF
     robot.set_remote(True)
     arm.start(SLIDE)
@@ -192,7 +194,7 @@ def test_remote_control_off_is_a_state_of_its_own(ur_pair: MakeUr) -> None:
 def test_a_stopped_arm_is_not_taken_control_of(ur_pair: MakeUr) -> None:
     arm, robot = ur_pair(connected=False)
     robot.inject(Kind.PROTECTIVE_STOP)
-    fails(arm.connect, driver.ANSWER_S, "unlock the stop at the pendant")
+    fails(arm.connect, settings.ANSWER_S, "unlock the stop at the pendant")
     assert robot.program.uploads == 0
 
 
@@ -201,7 +203,7 @@ def test_a_second_client_is_refused_and_the_first_slides_on(robot_of: Any, arm_o
     first = arm_on(robot)
     first.start([Segment(TARGET, 10.0)])
     second = arm_on(robot, connected=False)
-    fails(second.connect, driver.ANSWER_S, "a program is already running on it")
+    fails(second.connect, settings.ANSWER_S, "a program is already running on it")
     until(lambda: first.progress().done, 5.0)
     assert len(first.progress().finished) == 1
 
@@ -242,7 +244,7 @@ def test_somebody_elses_program_is_not_taken_over(robot_of: Any, arm_on: Any, pa
         robot.inject(Kind.PROGRAM_PAUSED)
     arm = arm_on(robot, connected=False)
     what = "a program is already " + ("paused" if paused else "running") + " on it"
-    fails(arm.connect, driver.ANSWER_S, f"{what}; end it at the pendant first")
+    fails(arm.connect, settings.ANSWER_S, f"{what}; end it at the pendant first")
     assert robot.program.foreign
     assert robot.program.program_running
     assert robot.program.uploads == 0
@@ -251,7 +253,7 @@ def test_somebody_elses_program_is_not_taken_over(robot_of: Any, arm_on: Any, pa
 def test_an_arm_without_power_is_said_to_have_none(ur_pair: MakeUr) -> None:
     arm, robot = ur_pair(connected=False)
     robot.inject(Kind.POWER_OFF)
-    fails(arm.connect, driver.ANSWER_S, r"not switched on \(power off\)")
+    fails(arm.connect, settings.ANSWER_S, r"not switched on \(power off\)")
     robot.restore()
     arm.connect()
     assert arm.state() is ArmState.READY
@@ -279,8 +281,8 @@ def test_a_controller_clock_that_falls_back_ends_the_stream(ur_pair: MakeUr, mov
     assert arm.progress().finished == ()
     arm.stop()  # by its dashboard, and seen on a new connection
     assert not robot.moving()
-    fails(lambda: arm.start(SLIDE), driver.PORT_S, "clock jumped back by 4.9")
-    until(lambda: not robot.program.program_running, 1 / ur_control.WATCHDOG_HZ + BUSY_S)
+    fails(lambda: arm.start(SLIDE), settings.PORT_S, "clock jumped back by 4.9")
+    until(lambda: not robot.program.program_running, 1 / settings.WATCHDOG_HZ + BUSY_S)
     reconnect(arm)
 
 
@@ -288,7 +290,7 @@ def test_a_stream_of_nonsense_is_a_lost_one(ur_pair: MakeUr) -> None:
     arm, robot = sliding(*ur_pair())
     robot.program.joints_deg[2] = float("nan")
     until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
-    fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "cannot be confirmed at rest")
+    fails(arm.stop, 2 * settings.PORT_S + 2 * settings.STILL_S, "cannot be confirmed at rest")
     assert not robot.moving()
 
 
@@ -309,11 +311,11 @@ def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
     monkeypatch.setattr(arm, "_take", lambda packet: None)  # none of those after the start comes
     arm.start(SLIDE)
     robot.inject(Kind.LINK_CUT)
-    until(lambda: arm.progress().done, 2 * driver.PORT_S + BUSY_S)
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
+    until(lambda: arm.progress().done, 2 * settings.PORT_S + BUSY_S)
+    fails(arm.stop, 2 * settings.PORT_S, "cannot be reached to stop it")
+    fails(arm.stop, 2 * settings.PORT_S, "cannot be reached to stop it")
     arm.close()
-    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to stop it")
+    fails(arm.stop, 2 * settings.PORT_S, "cannot be reached to stop it")
     robot.restore_link()
     arm.stop()  # now it is confirmed at rest
     assert not robot.moving()
@@ -376,9 +378,9 @@ sys.stdin.read()
 def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> None:
     """The control client stops it when its program dies; the watchdog when both die."""
     robot = robot_of()
-    settings = ur_settings(robot.host).model_dump_json()
+    arm_settings = ur_settings(robot.host).model_dump_json()
     program = subprocess.Popen(
-        [sys.executable, "-c", DRIVES, settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", DRIVES, arm_settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert program.stdin is not None
     with program.stdout, program.stdin:
@@ -390,6 +392,6 @@ def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> 
         program.wait(5.0)
     until(lambda: not robot.moving(), BUSY_S)
     way_mm = robot.pose().xyz_mm[1] - killed_mm
-    guaranteed_s = 1 / ur_control.WATCHDOG_HZ if whole else 0.5
+    guaranteed_s = 1 / settings.WATCHDOG_HZ if whole else 0.5
     assert way_mm < 20.0 * (guaranteed_s + 1.0)
     print(f"{'both' if whole else 'program'} killed at 20 mm/s: {way_mm:.2f} mm")

@@ -8,8 +8,9 @@ import pytest
 
 from sliplab.rigs.core.fakes import HOME
 from sliplab.rigs.core.pose_stream import PoseJumpError
-from sliplab.rigs.devices.ur.driver import SILENCE_S, UrArm
+from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.rtde import Packet, RtdeError
+from sliplab.rigs.devices.ur.settings import SILENCE_S
 from tests.rigs.devices.conftest import ur_settings
 
 START_NS = 10**12

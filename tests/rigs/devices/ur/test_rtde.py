@@ -16,7 +16,6 @@ from sliplab.rigs.devices.ur.rtde import (
     DATA,
     GET_VERSION,
     HEADER,
-    PORT,
     REQUEST_PROTOCOL_VERSION,
     SETUP_OUTPUTS,
     START,
@@ -24,6 +23,7 @@ from sliplab.rigs.devices.ur.rtde import (
     RtdeError,
     RtdeReader,
 )
+from sliplab.rigs.devices.ur.settings import RTDE_PORT
 from tests.rigs.waiting import own_address
 
 LIMIT_S = 0.3
@@ -55,7 +55,7 @@ def controller(sends: bytes, answers: dict[int, bytes] = ANSWERS) -> Iterator[st
     An answer that is left out is chatter without end instead.
     """
     host = own_address()
-    door = socket.create_server((host, PORT))
+    door = socket.create_server((host, RTDE_PORT))
     ending = threading.Event()
 
     def chatter(link: socket.socket) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.storage.workers import WORKERS, MainModuleError, check_work, refuse_main
+from sliplab.storage.spawn_context import WORKERS, MainModuleError, check_work, refuse_main
 from tests.conftest import ROOT
 
 SCRIPT = """
@@ -22,7 +22,7 @@ from pathlib import Path
 with Path(sys.argv[1]).open("a") as log:
     log.write("moved\\n")
 
-from sliplab.storage.workers import WORKERS, check_work
+from sliplab.storage.spawn_context import WORKERS, check_work
 
 with ProcessPoolExecutor(2, WORKERS) as pool:
     print(pool.submit(operator.add, 1, 2).result(60))
@@ -79,7 +79,7 @@ def test_packages_start_processes_only_as_workers() -> None:
         path
         for package in ("sliplab", "protocols", "storage", "rigs", "analysis", "flows")
         for path in (ROOT / package).rglob("*.py")
-        if path.name != "workers.py"
+        if path.name != "spawn_context.py"
     ]
     others = ("get_context(", "multiprocessing.Process", "multiprocessing.Pool", "import Pool")
     assert len(sources) > 300
