@@ -521,7 +521,7 @@ def collect(
     Raises:
         InputError: protocol or rig is wrong, or the rig cannot take the protocol.
         StoreError: the store cannot be used.
-        CampaignStopped: collection cannot continue; the message says why.
+        sliplab.CampaignStopped: collection cannot continue; the message says why.
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
     from sliplab.flows.planning.run_request import make_request

@@ -72,7 +72,7 @@ def evaluate_on_classes(
 
 @flow(name="evaluate classes", validate_parameters=False, persist_result=False)
 def evaluate_classes_flow(argument: Opaque[tuple[ClassJob, Cluster | None]]) -> None:
-    """Make the samples where needed, then score."""
+    """Make the missing samples, then evaluate the classes."""
     job, cluster = argument.content
     store = job.labels.store
     with timed(store, "evaluate"):
@@ -87,7 +87,7 @@ def evaluate_classes_flow(argument: Opaque[tuple[ClassJob, Cluster | None]]) -> 
 
 @task(name="scores of classes", cache_policy=NO_CACHE, persist_result=False)
 def score_classes(argument: Opaque[tuple[ClassJob, dict[str, SampleSet]]]) -> None:
-    """Windows, recordings and classes, stored as one result."""
+    """Evaluate windows, recordings and classes, and store one result."""
     evaluate_classes(*argument.content)
 
 

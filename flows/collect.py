@@ -46,7 +46,7 @@ class CollectResult(CampaignCounts):
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
 def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) -> int:
-    """Take trials in their order, `BATCH` at most, until `BATCH_S` are over; return how many."""
+    """Collect trials in order, at most `BATCH` and for `BATCH_S`; return their number."""
     began, count = time.monotonic(), 0
     for trial in trials.content[:BATCH]:
         collector.content.take([trial])
@@ -58,7 +58,7 @@ def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
 def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
-    """Take the trials of a run request that its store lacks."""
+    """Collect the missing trials of a campaign."""
     request = run_request.content
     with (
         shown(request) as progress,

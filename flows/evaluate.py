@@ -73,7 +73,7 @@ def evaluate(
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
 def evaluate_flow(argument: Opaque[tuple[EvaluationJob, Cluster | None]]) -> None:
-    """Count spikes where needed, then score."""
+    """Count missing spikes, then evaluate the network."""
     job, cluster = argument.content
     keep, threads = spike_keeper(job.store, cluster), None if cluster is None else 1
     windows = training_settings(job.campaigns).windows
@@ -100,5 +100,5 @@ def evaluate_flow(argument: Opaque[tuple[EvaluationJob, Cluster | None]]) -> Non
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
 def score(argument: Opaque[tuple[EvaluationJob, SampleSet, SampleSet]]) -> None:
-    """Windows, detections and label errors, stored as one result."""
+    """Evaluate windows, detections and label errors, and store one result."""
     score_store(*argument.content)

@@ -6,6 +6,7 @@ A form is of a store, of trials (a campaign or one trial), or of a trained netwo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
-from sliplab.protocols.plugins import import_foreign
+from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import one_of
 from sliplab.storage.errors import StoreError
 
@@ -73,6 +74,20 @@ def export_names() -> list[str]:
     from sliplab.storage.formats.known import export_formats
 
     return [*export_formats(), "labels", *plugins().declared("exports")]
+
+
+def fitting_forms(place: str) -> str:
+    """Return the forms of a store, or those of a model where `place` is a file, for a message."""
+    by_kind: dict[str, list[str]] = {}
+    for name in export_names():
+        with suppress(PluginError):  # of a plug-in that cannot be used
+            by_kind.setdefault(known_export(name).of, []).append(name)
+    models, stores, trials = (
+        ", ".join(by_kind.get(kind, [])) for kind in ("model", "store", "trials")
+    )
+    if Path(place).is_file():
+        return f"a trained network has the forms {models}"
+    return f"a store has the forms {stores}; a campaign or a trial of it, as PART, {trials}"
 
 
 def known_export(name: str) -> Export:

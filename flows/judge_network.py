@@ -148,7 +148,7 @@ def _judge(judgement: Judgement, cluster: Cluster | None) -> bool:
 
 @flow(name="judge a network", validate_parameters=False, persist_result=False)
 def judge_flow(argument: Opaque[tuple[Judgement, Cluster | None]]) -> None:
-    """Count spikes of every test trial, then score."""
+    """Count the network's spikes in every test trial, then evaluate it."""
     judgement, cluster = argument.content
     with timed(judgement.store, "evaluate"):
         judgement.count(spike_keeper(judgement.store, cluster), None if cluster is None else 1)

@@ -51,7 +51,7 @@ def train_on_markers(
 def train_markers_flow(
     argument: Opaque[tuple[StoreLabels, list[Collected], list[ModelOnDisk]]],
 ) -> None:
-    """Train the seeds that are stale, one after the other."""
+    """Train the missing and stale seeds one after another."""
     labels, campaigns, models = argument.content
     with timed(labels.store, "train"):
         train, validation = (
@@ -63,7 +63,7 @@ def train_markers_flow(
 
 @task(name="train one seed on markers", cache_policy=NO_CACHE, persist_result=False)
 def train_one_on_markers(job: Opaque[tuple[ModelOnDisk, MarkerSamples, MarkerSamples]]) -> int:
-    """Train one classifier and keep it."""
+    """Train and store one classifier."""
     model, train, validation = job.content
     net = train_marker_model(model, train, validation)
     strict = model.info.validation.strict
@@ -94,7 +94,7 @@ def evaluate_on_markers(
 
 @flow(name="evaluate on markers", validate_parameters=False, persist_result=False)
 def evaluate_markers_flow(argument: Opaque[MarkerJob]) -> None:
-    """Score windows, detections and labels."""
+    """Evaluate windows, detections and labels."""
     job = argument.content
     with timed(job.labels.store, "evaluate"):
         evaluate_markers(job)

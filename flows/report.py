@@ -57,7 +57,7 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
 
 @flow(name="report", validate_parameters=False, persist_result=False)
 def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
-    """Write page and summary; the summary last, with the key."""
+    """Write the report's page, then its summary."""
     store, campaigns, key = argument.content
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
 def train_one(job: Opaque[tuple[ModelOnDisk, SampleSet, SampleSet, bool]]) -> int:
-    """Train one network and keep it."""
+    """Train and store one network."""
     model, train, validation, simulated = job.content
     settings = model.settings
     model.path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) ->
 def train_flow(
     argument: Opaque[tuple[StoreLabels, list[Collected], list[ModelOnDisk], Cluster | None]],
 ) -> int:
-    """Train the seeds that are stale, one after the other."""
+    """Train the missing and stale seeds one after another."""
     labels, campaigns, models, cluster = argument.content
     simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
     load = load_class_samples if models[0].classes else load_samples

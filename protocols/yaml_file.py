@@ -576,7 +576,12 @@ def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError
 def _faults(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
     """Return the faults of `error`, their keys below `model` as `KeyedError` has them."""
     items = sorted(_of_one_choice(error.errors()), key=lambda i: i["type"] != "extra_forbidden")
-    items = [item for item in items if not _is_short_by_faults(item, items)]
+    items = [
+        item
+        for item in items
+        if item["type"] != "default_factory_not_called"  # which follows from another fault
+        and not _is_short_by_faults(item, items)
+    ]
     meant = {_key((*item["loc"][:-1], close)) for item in items if (close := _close(model, item))}
     found: dict[str, KeyedError] = {}
     for item in items:

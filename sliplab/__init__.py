@@ -41,11 +41,13 @@ if TYPE_CHECKING:
         open_store,
         plan,
     )
+    from sliplab.flows.collecting.requests import CampaignStopped
     from sliplab.protocols.errors import InputError
     from sliplab.protocols.plan import Plan
     from sliplab.storage.errors import StoreError
 
 __all__ = [
+    "CampaignStopped",
     "Events",
     "InputError",
     "Model",
@@ -66,6 +68,7 @@ __all__ = [
 __version__: str
 
 _ELSEWHERE = {
+    "CampaignStopped": "sliplab.flows.collecting.requests",
     "InputError": "sliplab.protocols.errors",
     "Plan": "sliplab.protocols.plan",
     "StoreError": "sliplab.storage.errors",

@@ -30,9 +30,15 @@ app = typer.Typer()
 )
 def import_(
     kind_or_path: Annotated[
-        str, typer.Argument(metavar="[KIND] PATH", help="A file, or a folder of files.")
+        str,
+        typer.Argument(
+            metavar="KIND|PATH", help="A file, or a folder of files; or their KIND, before PATH."
+        ),
     ],
-    path: Annotated[Path | None, typer.Argument(metavar="", show_default=False)] = None,
+    path: Annotated[
+        Path | None,
+        typer.Argument(metavar="PATH", help="The file or folder after KIND.", show_default=False),
+    ] = None,
     store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
     name: Annotated[
         str | None,

@@ -11,7 +11,6 @@ import typer
 from sliplab.flows.cli.common import DATA, JsonOption, finish, located
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.shown import one_of
 
 if TYPE_CHECKING:
     from sliplab.flows.exports import ExportRequest
@@ -76,7 +75,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Export trials, a store or a network in a form of other programs."""
-    from sliplab.flows.exports import ExportRequest, export_names
+    from sliplab.flows.exports import ExportRequest, fitting_forms
 
     if form is None and part:
         form = "labels" if old_labels else old_form or "aedat4"
@@ -85,7 +84,7 @@ def export(
             f"--output {output}"
         )
     if form is None:
-        raise InputError("--as", "", None, "is needed: " + one_of("", export_names()))
+        raise InputError("--as", "", None, f"is needed: {fitting_forms(place)}")
     given = {
         "campaign": campaign,
         "title": title,

@@ -90,11 +90,14 @@ def parallel_map(
             raise
 
 
-@flow(name="pieces", validate_parameters=False, persist_result=False)
+@flow(name="parallel jobs", validate_parameters=False, persist_result=False)
 def parallel_map_flow(
     argument: Opaque[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
 ) -> int:
-    """`spread` for who has no flow. In a module: Prefect sends a flow along with its tasks."""
+    """Run jobs in parallel, for a caller that is not in a flow.
+
+    It is in a module, since Prefect sends a flow along with its tasks.
+    """
     parallel_map(*argument.content)
     return len(argument.content[2])
 
@@ -103,7 +106,7 @@ def parallel_map_flow(
 def _local_chunk(
     argument: Opaque[tuple[Piece, Sequence[Any], int, ProcessPoolExecutor, Done]],
 ) -> int:
-    """Run some pieces on all cores; each result is passed on as soon as it is ready."""
+    """Run jobs on all cores; pass each result on as soon as it is ready."""
     piece, jobs, start, pool, done = argument.content
     with out_of_reach():
         futures = {pool.submit(piece, job): start + k for k, job in enumerate(jobs)}
@@ -138,7 +141,7 @@ def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluste
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
 def _remote_chunk(payload: Pickled[tuple[Piece, Sequence[Any], dict[str, str]]]) -> list[Any]:
-    """Some pieces, one after the other, on a worker that may have joined after the others."""
+    """Run jobs one after another on a worker, which may have joined late."""
     from sliplab.flows.running.cluster import same_program
 
     piece, jobs, program = payload.content
@@ -216,7 +219,7 @@ def run_trials(
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
 def _trials_flow(argument: Opaque[_Step]) -> int:
-    """Compute the results of the stale trials."""
+    """Compute missing and stale results of trials."""
     step = argument.content
     with timed(step.store, step.title):
         keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)

@@ -162,13 +162,13 @@ served: Callable[..., Any] = partial(
 
 @served(name="collect")
 def collect(wanted: Collect) -> Any:
-    """Take the trials that the store lacks; run again to resume."""
+    """Collect the missing trials of a protocol; run it again to resume."""
     return run_of(partial(_collect, wanted))
 
 
 @served(name="label")
 def label(wanted: ScheduledStep = STEP) -> Any:
-    """Find the true onsets of every trial."""
+    """Label the slip onsets of every trial."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "label"))
 
 
@@ -180,7 +180,7 @@ def train(wanted: ScheduledStep = STEP) -> Any:
 
 @served(name="evaluate")
 def evaluate(wanted: Evaluate = EVALUATE) -> Any:
-    """Score the network on trials it has never seen."""
+    """Evaluate the network on the test trials."""
     options = {"margin": wanted.margin, "smoothing": wanted.smoothing}
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "evaluate", **options))
 
@@ -193,31 +193,31 @@ def report(wanted: ScheduledStep = STEP) -> Any:
 
 @served(name="study")
 def study(wanted: ScheduledStudy = STUDY) -> Any:
-    """The whole chain: collect, sync, label, train, evaluate, report."""
+    """Collect, sync, label, train, evaluate and report, over all protocols of the study."""
     return run_of(partial(_study, wanted))
 
 
 @served(name="chain")
 def chain(wanted: ScheduledChain) -> Any:
-    """Collect, then label, train and evaluate what there is."""
+    """Collect, then label, train and evaluate the trials in the store."""
     return run_of(partial(_chain, wanted))
 
 
 @served(name="pause")
 def pause(wanted: Ask = ASK) -> Any:
-    """Let the trial that runs come to its end, then stand still."""
+    """Pause the collection after the current trial."""
     return run_of(partial(_ask, "pause", wanted))
 
 
 @served(name="resume")
 def resume(wanted: Ask = ASK) -> Any:
-    """Go on after a pause."""
+    """Resume a paused collection."""
     return run_of(partial(_ask, "resume", wanted))
 
 
 @served(name="stop")
 def stop(wanted: Ask = ASK) -> Any:
-    """Stop the collection that runs now, the arm first."""
+    """Stop the current collection; the arm stops first."""
     return run_of(partial(_ask, "stop", wanted))
 
 

@@ -150,7 +150,7 @@ class OnRig(Parameters):
 
 
 class Collect(OnRig):
-    """Takes the trials that the store lacks."""
+    """Parameters of collecting the missing trials of a protocol."""
 
     protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
     trials: int | None = Field(
@@ -164,7 +164,7 @@ class Collect(OnRig):
 
 
 class ScheduledChain(Collect):
-    """Collection, then labels and evaluation of what there is."""
+    """Parameters of collecting, then labelling, training and evaluating."""
 
     train: bool = Field(
         default=True,
@@ -173,7 +173,7 @@ class ScheduledChain(Collect):
 
 
 class ScheduledStudy(OnRig):
-    """The whole chain over the shipped protocols, to the report."""
+    """Parameters of the whole study of the shipped protocols, up to the report."""
 
     pilot: bool = Field(default=False, description="Use the small pilot protocols.")
     extra: bool = Field(
@@ -182,13 +182,13 @@ class ScheduledStudy(OnRig):
 
 
 class ScheduledStep(Parameters):
-    """One step on what is stored."""
+    """Parameters of an analysis step on stored trials."""
 
     campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
 class Evaluate(ScheduledStep):
-    """Scores the network on trials it has never seen."""
+    """Parameters of evaluating the network on the test trials."""
 
     margin: float | None = Field(
         default=None, ge=0, le=1e6, description="Spikes a winner must lead by."
@@ -199,7 +199,7 @@ class Evaluate(ScheduledStep):
 
 
 class Ask(Parameters):
-    """A word to the collection that runs."""
+    """Parameters of a request to the current collection."""
 
     who: str = Field(default="", description="Requester's name; stored with the request.")
     why: str = Field(default="", description="The reason; stored with the request.")

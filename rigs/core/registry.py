@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from sliplab.protocols.plugin import package_of, plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
-from sliplab.protocols.shown import one_of
+from sliplab.protocols.shown import did_you_mean
 from sliplab.rigs.core.driver import Driver
 
 DriverT = TypeVar("DriverT", bound=Driver[Any])
@@ -97,6 +97,7 @@ def find_driver(name: str, kind: type[DriverT]) -> DriverT:
 
 
 def _unknown(name: str, kind: type[Driver[Any]]) -> str:
+    """Return the message about a driver of no installed package."""
     names, broken = [], []
     for item in listed().values():
         try:
@@ -104,7 +105,11 @@ def _unknown(name: str, kind: type[Driver[Any]]) -> str:
                 names.append(item.name)
         except DriverError as error:
             broken.append(str(error))
-    return "; ".join([one_of(name, names), *broken])
+    text = (
+        "is a driver of no installed package: install the package that has it (`sliplab rigs "
+        f"--drivers` lists the installed ones), or choose one of {', '.join(names)}"
+    )
+    return "; ".join([text + did_you_mean(name, names), *broken])
 
 
 @cache

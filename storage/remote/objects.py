@@ -38,6 +38,10 @@ SMALL_BYTES = 8_000_000
 """Limit of objects that are read at once."""
 _BLOCK = 8_000_000
 _URL = re.compile(r"([a-z][a-z0-9+.-]*)://.+")
+_ADDRESSES = (
+    "the address of shared or object storage: s3://BUCKET/FOLDER, file:///FOLDER, or another that "
+    "fsspec can list, such as gs:// or sftp://"
+)
 _SECRET_VARIABLES = ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_ACCESS_KEY_ID")
 _ANSWER_CHARACTERS = 200
 """Limit of what is passed on of a server's message."""
@@ -70,10 +74,11 @@ def check_url(url: str) -> str:
     """Return `url` without a slash at its end.
 
     Raises:
-        InputError: it is not a URL, is of a kind that chains others, or carries a secret.
+        InputError: it is not a URL, is of the web, is of a kind that chains others, or carries a
+            secret.
     """
     if not is_url(url):
-        raise InputError("URL", "", url, "must be a URL such as s3://bucket/folder")
+        raise InputError("URL", "", url, f"must be {_ADDRESSES}")
     parts = urlsplit(url)
     if parts.username or parts.password or parts.query or parts.fragment:
         shown = f"{parts.scheme}://.../{parts.path.lstrip('/')}"
@@ -84,6 +89,9 @@ def check_url(url: str) -> str:
             "must not contain keys, passwords or options: put them into the "
             "environment or fsspec's configuration",
         )
+    if parts.scheme in ("http", "https"):
+        text = f"is a web page's address, whose files cannot be listed; give {_ADDRESSES}"
+        raise InputError("URL", "", url, text)
     if "::" in url or ".." in parts.path.split("/"):
         raise InputError("URL", "", url, "must name one location, without '::' and '..'")
     return url.rstrip("/")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sliplab
+from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store as TrialStore
 from tests.flows.older import older_store
@@ -42,6 +43,7 @@ def test_importing_it_loads_no_library() -> None:
 def test_every_name_is_there_and_others_are_not() -> None:
     assert {name for name in sliplab.__all__ if getattr(sliplab, name, None) is None} == set()
     assert dir(sliplab) == sorted(sliplab.__all__)
+    assert sliplab.CampaignStopped is CampaignStopped
     with pytest.raises(AttributeError, match="has no attribute 'opne_store'"):
         sliplab.opne_store  # type: ignore[attr-defined]  # noqa: B018
 

@@ -331,6 +331,16 @@ def test_wrong_outputs_and_files(tmp_path: Path) -> None:
         load_external(path)
 
 
+def test_a_file_that_is_no_description_lacks_keys_only(tmp_path: Path) -> None:
+    path = tmp_path / "card.json"
+    path.write_text('{"title": "seed 0", "classes": ["cup"]}')
+    with pytest.raises(InputError) as wrong:
+        load_external(path)
+    keys = {fault.key for fault in wrong.value.faults}
+    assert keys == {"title", "model", "weights", "layers", "classes"}
+    assert "Undefined" not in str(wrong.value)
+
+
 def test_the_documented_description_is_one() -> None:
     text = (ROOT / "docs" / "models.md").read_text()
     block = text.split('```yaml title="lab.yaml"\n')[1].split("```")[0]

@@ -39,6 +39,7 @@ def test_former_options_give_the_same_files_and_name_the_new_ones(
     done = here(*asked, old, "--format", "dsec")
     assert done.returncode == 0
     assert f"write: sliplab export {store} small --as dsec" in " ".join(done.stderr.split())
+    assert answer(*asked, new, "--as", "dsec") == found  # files of the same names are replaced
     assert found["trials"] == len(list(new.glob("*.h5"))) == len(list(old.glob("*.h5")))
     for path in new.glob("*.csv"):
         assert path.read_bytes() == (old / path.name).read_bytes()
@@ -47,7 +48,11 @@ def test_former_options_give_the_same_files_and_name_the_new_ones(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ((), "--as: is needed: must be one of aedat4, dsec, labels"),
+        (
+            (),
+            "--as: is needed: a store has the forms croissant, mcap, lerobot; a campaign or a "
+            "trial of it, as PART, aedat4, dsec, labels",
+        ),
         (("--as", "dsek"), "--as = dsek: must be one of"),
         (("--as", "dsec"), "PART: is needed: --as dsec is of a campaign or a trial"),
         (("small", "--as", "mcap"), "PART = small: is too much: --as mcap is of a store"),
@@ -64,3 +69,13 @@ def test_what_is_wrong_is_named(
     assert done.returncode == 2, done.stderr
     assert says in " ".join(done.stderr.split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_export_of_a_model_without_form_names_the_forms_of_models(tmp_path: Path) -> None:
+    model = tmp_path / "seed0.pt"
+    model.write_bytes(b"")
+    done = here("export", model, "--output", tmp_path / "out")
+    assert done.returncode == 2, done.stderr
+    forms = " ".join(done.stderr.split()).partition("--as: is needed: ")[2]
+    assert forms.startswith("a trained network has the forms ")
+    assert set(forms.rpartition(" forms ")[2].split(", ")) == {"card", "onnx"}

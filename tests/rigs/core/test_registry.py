@@ -88,6 +88,11 @@ def test_a_driver_of_another_package_is_used_and_imported_only_then(install: Ins
         ({"driver": "lab", "bias_mv": 500}, "event_camera.bias_mv", "must be less than or equal"),
         ({"driver": "lab", "bias": 5}, "event_camera.bias", "did you mean 'bias_mv'?"),
         ({"driver": "lap"}, "event_camera.driver", "did you mean 'lab'?"),
+        (
+            {"driver": "prophesee"},
+            "event_camera.driver",
+            "is a driver of no installed package: install the package that has it",
+        ),
         ({"driver": "ur"}, "event_camera.driver", "is the driver of a kind of arm"),
     ],
 )

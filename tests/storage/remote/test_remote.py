@@ -374,6 +374,9 @@ def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_
         assert "hunter2" not in wrong.value.message
     with pytest.raises(InputError, match="cannot be used"):
         Remote("nonsense://a/b")
+    for url in ("https://example.org/store", "http://example.org/store"):
+        with pytest.raises(InputError, match=r"web page's .* s3://BUCKET/FOLDER, file:///FOLDER"):
+            Remote(url)
     with pytest.raises(RemoteError, match=r"ftp://localhost:1/x: cannot be reached: .*refused"):
         Remote("ftp://localhost:1/x")
     assert is_url("s3://a/b")
