@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.nuisances import FlickerNuisance
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move, Twist
@@ -25,8 +26,6 @@ from sliplab.protocols.quantity import (
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.protocols.yaml_file import (
-    NAME_PATTERN,
-    KeyedError,
     StrictModel,
     mask_secrets,
     parse_yaml,

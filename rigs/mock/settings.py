@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 from sliplab.rigs.mock.fault_settings import Fault, check_papillae, check_single
 
 if TYPE_CHECKING:
