@@ -39,7 +39,7 @@ from sliplab.rigs.core.calibration import Calibration, without_taught
 from sliplab.rigs.core.driver import Driver, EventCameraDriver
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.mock.fault_settings import StreamGone
+from sliplab.rigs.mock.fault_kinds import StreamGone
 from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.stream_settings import (
