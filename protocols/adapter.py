@@ -22,8 +22,9 @@ from sliplab.protocols.adapter_parts import (
     Markers,
     TrialFiles,
 )
+from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, load, rule
+from sliplab.protocols.yaml_file import StrictModel, load, rule
 
 CLASSES = "classes"
 """The experiment whose recordings show one of several classes each, instead of a slip."""

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from sliplab.protocols.file_pattern import parse_pattern, template_fields
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.units import all_symbols, find_unit
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 BUILT_IN = ("stem", "folder", "path", "id")
 """Fields of every trial: name of its file without the ending, name of the file's folder, path below

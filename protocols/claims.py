@@ -17,9 +17,10 @@ from pydantic import Field, PlainSerializer, WithJsonSchema, field_validator
 
 from sliplab.protocols.factors import MAX_TRIALS, ContextLevel, Factor, unknown_factor
 from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.quantity import canonical, parse
 from sliplab.protocols.shown import one_of
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 FigureName = Literal[
     "accuracy", "latency_incipient", "latency_gross", "lead", "slip_duration", "first_slip"

@@ -17,10 +17,11 @@ from pydantic import (
     model_validator,
 )
 
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.quantity import canonical, check_size, number_meant, parse, to_decimal
 from sliplab.protocols.shown import did_you_mean, foreign_character
 from sliplab.protocols.units import all_symbols, canonical_of, faults, find_unit
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 MAX_TRIALS = 1_000_000
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")

@@ -24,6 +24,7 @@ from sliplab.protocols.factors import (
     written_units,
 )
 from sliplab.protocols.gates import Gates
+from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.limits import ProtocolLimits
 from sliplab.protocols.maintenance import Maintenance, ReferenceSettings
 from sliplab.protocols.nuisances import Nuisances
@@ -33,7 +34,7 @@ from sliplab.protocols.recording import RecordingSettings
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.shown import nearest
 from sliplab.protocols.templates import expand, templates
-from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 

@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 from sliplab.protocols.factors import Level
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.nuisances import (
     MIX,
@@ -39,7 +40,7 @@ from sliplab.protocols.phases import (
 )
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step, Twist
 from sliplab.protocols.quantity import FactorRef, canonical, check_least
-from sliplab.protocols.yaml_file import KeyedError, raise_all
+from sliplab.protocols.yaml_file import raise_all
 
 Condition = Mapping[str, Level]
 _ByArm = ArmMotion | Rotation | Regrasp

@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, field_validator
 
+from sliplab.protocols.key_errors import KeyedError, register_tags
 from sliplab.protocols.quantity import (
     REF_SCHEMA,
     FactorRef,
@@ -36,7 +37,7 @@ from sliplab.protocols.quantity import (
     word_or_ref,
 )
 from sliplab.protocols.shown import one_of
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
+from sliplab.protocols.yaml_file import StrictModel
 
 NONE, MIX = "none", "mix"
 """Levels that apply no nuisance, and all of them at once."""

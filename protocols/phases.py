@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
+from sliplab.protocols.key_errors import register_tags
 from sliplab.protocols.quantity import (
     REF_SCHEMA,
     AnyMillimetresOrRef,
@@ -24,7 +25,7 @@ from sliplab.protocols.quantity import (
     SpeedOrRef,
     word_or_ref,
 )
-from sliplab.protocols.yaml_file import StrictModel, register_tags, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 
 class Approach(StrictModel):

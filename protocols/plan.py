@@ -20,6 +20,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.factors import Level, in_canonical_unit, unknown_factor
 from sliplab.protocols.gates import Gates
 from sliplab.protocols.hashing import hash_data, hash_integer
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits, path_fault
 from sliplab.protocols.nuisances import requests
@@ -31,14 +32,7 @@ from sliplab.protocols.shown import did_you_mean, plural
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.templates import in_terms_of_template
 from sliplab.protocols.units import file_text
-from sliplab.protocols.yaml_file import (
-    KeyedError,
-    input_error,
-    parse_leniently,
-    raise_all,
-    read_text,
-    validate,
-)
+from sliplab.protocols.yaml_file import input_error, parse_leniently, raise_all, read_text, validate
 
 if TYPE_CHECKING:
     import pandas as pd

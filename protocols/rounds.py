@@ -9,9 +9,9 @@ from itertools import count
 
 from sliplab.protocols.claims import AdaptiveChoice, Stopping
 from sliplab.protocols.factors import Level
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.model import Collection
 from sliplab.protocols.shown import plural
-from sliplab.protocols.yaml_file import KeyedError
 
 Levels = Mapping[str, tuple[Level, ...]]
 """Enabled levels of each factor."""

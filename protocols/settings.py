@@ -12,13 +12,14 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from sliplab.protocols.detection import Detection
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.presets import COMPARED, PAPER, Value, at, expanded
 from sliplab.protocols.split import Split
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import SampleSettings, Windows
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 
 class AnalysisSettings(StrictModel):

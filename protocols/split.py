@@ -16,9 +16,10 @@ from pydantic import Field, WithJsonSchema
 
 from sliplab.protocols.factors import Factor, Level, unknown_factor
 from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.quantity import canonical, parse
 from sliplab.protocols.shown import did_you_mean
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 GOLDEN = 0.6180339887498949
 _SCALE = float(1 << 63)

@@ -23,10 +23,11 @@ from typing import Any, Literal
 import yaml
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.quantity import parse_or_ref
 from sliplab.protocols.shipped import shipped_files
 from sliplab.protocols.shown import one_of
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, load, parse_yaml
+from sliplab.protocols.yaml_file import StrictModel, load, parse_yaml
 
 FOLDER = Path(__file__).parent / "templates"
 KEY = "collection.motion"

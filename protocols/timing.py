@@ -12,8 +12,9 @@ from typing import Literal
 
 from pydantic import Field
 
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.quantity import PositiveSeconds
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 Code = Literal["lfsr", "irregular", "regular"]
 """Pulses of the box: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""

@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 
 class Windows(StrictModel):

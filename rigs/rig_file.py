@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.nuisances import FlickerNuisance
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Move, Twist
@@ -25,8 +26,6 @@ from sliplab.protocols.quantity import (
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.protocols.yaml_file import (
-    NAME_PATTERN,
-    KeyedError,
     StrictModel,
     mask_secrets,
     parse_yaml,
@@ -40,7 +39,7 @@ from sliplab.rigs.core.calibration import Calibration, without_taught
 from sliplab.rigs.core.driver import Driver, EventCameraDriver
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.mock.fault_settings import StreamGone
+from sliplab.rigs.mock.fault_kinds import StreamGone
 from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.stream_settings import (

@@ -25,9 +25,10 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean
 from sliplab.protocols.timing import StreamGrade, StreamTiming
-from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel, rule
+from sliplab.protocols.yaml_file import ChosenModel, StrictModel, rule
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
 from sliplab.rigs.core.driver import (
     Driver,

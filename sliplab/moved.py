@@ -13,6 +13,9 @@ MOVED = {
     "sliplab.rigs.testing": "sliplab.plugins.driver_kit",
     "sliplab.analysis.bench": "sliplab.plugins.bench",
     "sliplab.protocols.conditions": "sliplab.protocols.model",
+    "sliplab.flows.ui.review_page": "sliplab.flows.ui.review_tab",
+    "sliplab.rigs.mock.faults": "sliplab.rigs.mock.fault_book",
+    "sliplab.rigs.mock.fault_settings": "sliplab.rigs.mock.fault_kinds",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }
 """Old names of packages and modules, and what they are now."""

@@ -1,1 +1,5 @@
-../../sliplab/__main__.py
+"""`python -m sliplab`: the command line."""
+
+from sliplab.flows.__main__ import main
+
+main()

@@ -33,9 +33,10 @@ from sliplab.analysis.networks.network import (
     set_weights,
 )
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import KeyedError, register_tags
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.windows import Windows
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, input_error, load, register_tags
+from sliplab.protocols.yaml_file import StrictModel, input_error, load
 from sliplab.storage.files import read_plain
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]

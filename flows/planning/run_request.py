@@ -20,10 +20,10 @@ from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.templates import written_out
 from sliplab.protocols.yaml_file import (
-    KeyedError,
     input_error,
     mask_secrets,
     parse_yaml,

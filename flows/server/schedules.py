@@ -25,15 +25,9 @@ from zoneinfo import ZoneInfo, available_timezones
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from sliplab.protocols import InputError
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean, one_of
-from sliplab.protocols.yaml_file import (
-    KeyedError,
-    StrictModel,
-    parse_leniently,
-    read_text,
-    rule,
-    validate,
-)
+from sliplab.protocols.yaml_file import StrictModel, parse_leniently, read_text, rule, validate
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"

@@ -25,7 +25,7 @@ from tornado.web import HTTPError
 
 from sliplab.flows.running.same_origin import own_hosts, refusal
 from sliplab.flows.ui.review import TrialList
-from sliplab.flows.ui.review_page import ReviewTab
+from sliplab.flows.ui.review_tab import ReviewTab
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import user_name
 from sliplab.storage.trials.store import Store

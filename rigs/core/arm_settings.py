@@ -11,7 +11,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.yaml_file import StrictModel, rule
 from sliplab.rigs.core.address import Host
 from sliplab.rigs.core.device_settings import DriverSettings
 

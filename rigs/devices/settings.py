@@ -13,7 +13,8 @@ from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from sliplab.protocols.yaml_file import ChosenModel, KeyedError, StrictModel, register_tags_of
+from sliplab.protocols.key_errors import KeyedError, register_tags_of
+from sliplab.protocols.yaml_file import ChosenModel, StrictModel
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings, GripperSettings
 from sliplab.rigs.core.driver import (

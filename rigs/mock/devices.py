@@ -13,7 +13,7 @@ from sliplab.protocols.timing import FrameGrade, StreamTiming, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.fault_settings import CabledDevice, DeviceGone, DiskFull, StreamGone
+from sliplab.rigs.mock.fault_kinds import CabledDevice, DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, FurtherFrameCamera

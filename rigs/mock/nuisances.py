@@ -22,7 +22,8 @@ from sliplab.protocols.nuisances import (
     VibrationNuisance,
     Warmth,
 )
-from sliplab.rigs.mock.fault_settings import (
+from sliplab.rigs.mock.fault_book import FaultBook
+from sliplab.rigs.mock.fault_kinds import (
     AnyFault,
     EventGap,
     EventNoise,
@@ -31,7 +32,6 @@ from sliplab.rigs.mock.fault_settings import (
     Shaking,
     SkinBrushed,
 )
-from sliplab.rigs.mock.faults import FaultBook
 from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.scene.randomness import generator
 

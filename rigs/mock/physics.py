@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.finger_motion import FingerMotion
-from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.fault_book import NEVER
 from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.scene.contact import advance

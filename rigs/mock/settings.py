@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, rule
-from sliplab.rigs.mock.fault_settings import Fault, check_papillae, check_single
+from sliplab.protocols.yaml_file import StrictModel, rule
+from sliplab.rigs.mock.fault_kinds import Fault, check_papillae, check_single
 
 if TYPE_CHECKING:
     from sliplab.rigs.scene import skin as scene_skin

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, TrueOnsets, Truth
-from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.fault_book import NEVER
 from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.kernels import njit

@@ -35,7 +35,7 @@ def loaded(*words: str) -> list[str]:
 
 def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
     assert loaded("plan", "pilot", "--json") == []
-    options = ("--rig", "mock", "--store", str(tmp_path / "store"), "--trials", "1")
+    options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
     assert loaded("collect", "pilot", *options) == []
     assert "sliplab.plugins.bench.study" in loaded("bench", "--help")
     assert "sliplab.plugins.bench.run" not in loaded("bench", "--help")
@@ -57,7 +57,7 @@ def test_claims_load_what_they_need_when_trials_are_taken(tmp_path: Path) -> Non
     pilot = (ROOT / "protocols" / "pilot.yaml").read_text()
     claims.write_text(pilot.replace("collection:\n", f"collection:\n{stopping}", 1))
     assert loaded("plan", str(claims), "--json") == []
-    options = ("--rig", "mock", "--store", str(tmp_path / "store"), "--trials", "1")
+    options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
     collected = loaded("collect", str(claims), *options)
     assert "sliplab.plugins.claims.rounds" in collected
     assert not [name for name in collected if name.startswith("sliplab.plugins.claims.power")]

@@ -8,9 +8,9 @@ import pytest
 
 from sliplab.protocols import load_plan
 from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.windows import Windows
-from sliplab.protocols.yaml_file import KeyedError
 from tests.conftest import ROOT
 
 

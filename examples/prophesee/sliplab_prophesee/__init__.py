@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.rigs.core.address import Host
 from sliplab.rigs.core.capabilities import EventCamera
 from sliplab.rigs.core.device_settings import DriverSettings

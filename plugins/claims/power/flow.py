@@ -43,15 +43,10 @@ from sliplab.plugins.claims.simulated import claims_of
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import Claim, Stopping
 from sliplab.protocols.consistency import check_consistency
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.protocols.yaml_file import (
-    KeyedError,
-    input_error,
-    parse_leniently,
-    raise_all,
-    validate,
-)
+from sliplab.protocols.yaml_file import input_error, parse_leniently, raise_all, validate
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

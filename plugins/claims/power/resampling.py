@@ -24,7 +24,7 @@ from sliplab.plugins.claims.evidence import TrialGrid, planned_end
 from sliplab.plugins.claims.expectation import expectation
 from sliplab.protocols import Plan
 from sliplab.protocols.factors import Factor, Level
-from sliplab.protocols.yaml_file import KeyedError
+from sliplab.protocols.key_errors import KeyedError
 
 DONORS = 10
 """Trials of a pilot that a figure may come from, at least."""

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, rule
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.yaml_file import rule
 from sliplab.rigs.core.device_settings import DriverSettings
 
 Angle = Annotated[float, Field(ge=-360, le=360)]

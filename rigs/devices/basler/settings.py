@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, rule
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.yaml_file import rule
 from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 FrameTrigger = Literal["hardware", "software", "free run"]

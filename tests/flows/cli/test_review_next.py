@@ -12,7 +12,7 @@ import pytest
 from bokeh.document import Document
 
 from sliplab.flows.ui.review import TrialList, filtered_rows
-from sliplab.flows.ui.review_page import ReviewTab
+from sliplab.flows.ui.review_tab import ReviewTab
 from sliplab.storage.trials.store import Store
 from tests.analysis.review.evaluated import Evaluated
 from tests.command_line import here

@@ -31,9 +31,10 @@ from sliplab.plugins.claims.power.resampling import (
 )
 from sliplab.plugins.claims.simulated import claims_of, course
 from sliplab.protocols import Plan
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
-from sliplab.protocols.yaml_file import KeyedError, validate
+from sliplab.protocols.yaml_file import validate
 from tests.conftest import SMALL
 
 DEPTHS = (Decimal("2.4"), Decimal("2.8"), Decimal("3.4"))

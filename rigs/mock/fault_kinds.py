@@ -10,7 +10,8 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags, rule
+from sliplab.protocols.key_errors import KeyedError, register_tags
+from sliplab.protocols.yaml_file import StrictModel, rule
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.mock.fault_settings import (
+from sliplab.rigs.mock.fault_kinds import (
     AnyFault,
     ArmProtectiveStop,
     ArmRamp,
