@@ -15,22 +15,22 @@ unexport PYTHONDONTWRITEBYTECODE
 
 setup: $(DONE)
 
-# the core first: while one processor installs the rest, the other compiles kernels
+# what simulates first: while one processor installs the rest, the other compiles kernels
 define install
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) .
-	$(BIN)/python .ci/kernels.py & kernels=$$!; \
+	$(PIP) '.[video]'
+	$(BIN)/python .ci/kernels.py $(2) & kernels=$$!; \
 	$(PIP) '.[$(1)]'; installed=$$?; wait $$kernels; exit $$installed
 endef
 
 NEEDS := pyproject.toml setup.py constraints.txt
 $(DONE): $(NEEDS)
-	$(call install,dev)
+	$(call install,dev,rehearsal mock)
 	touch $(DEMO) $(DONE)
 
 # only what the demo needs: no drivers, linters and formats
 $(DEMO): $(NEEDS)
-	$(call install,learn)
+	$(call install,learn,rehearsal)
 	touch $(DEMO)
 
 demo: $(DEMO)

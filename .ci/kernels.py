@@ -1,7 +1,11 @@
-"""Compile what most tests call, once, with the core alone: simulated trials and their labels."""
+"""Compile what most tests call, once, with the core and the extra `video`: simulated trials and their labels.
+
+python .ci/kernels.py RIG...
+"""
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -17,9 +21,11 @@ ROOT = Path(__file__).parents[1]
 TRIALS = [("pilot", "rehearsal"), ("pilot_gravity", "rehearsal"), ("pilot", "mock")]
 
 
-def main() -> None:
-    """Take the shortest trial of each protocol on its rig, and label it by both cameras."""
+def main(rigs: list[str]) -> None:
+    """Take the shortest trial of each protocol on these rigs, and label it by both cameras."""
     for protocol, rig_name in TRIALS:
+        if rig_name not in rigs:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             request = make_request(
                 ROOT / "protocols" / f"{protocol}.yaml",
@@ -39,4 +45,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
