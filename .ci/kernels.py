@@ -1,6 +1,8 @@
-"""Compile what most tests call, once, with the core and the extra `video`: simulated trials and their labels.
+"""Compile what most tests call, once: simulated trials and their labels.
 
-python .ci/kernels.py RIG...
+    python .ci/kernels.py RIG...
+
+It needs the core and the extra `video`.
 """
 
 from __future__ import annotations

@@ -69,6 +69,7 @@ def camera_shift(away: Floats) -> CameraShift:
     return CameraShift(shift, unsure, sigma)
 
 
+# loops rather than expressions of arrays, of which each takes numba as long as a whole kernel
 @njit(cache=True, nogil=True)
 def _followed(away: Any) -> Any:
     """Return shift, unsure and sigma of each frame, and whether many markers at rest moved."""
@@ -76,47 +77,84 @@ def _followed(away: Any) -> Any:
     shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
     stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
     velocity, before = np.zeros((m, 2)), np.full((m, 2), np.nan)
-    now, drifted, fastest, restless = np.zeros(2), False, 0.0, 0
+    seen, hold = np.zeros(m, np.bool_), np.zeros(m, np.bool_)
+    near, still = np.zeros(m, np.bool_), np.zeros(m, np.bool_)
+    known, new, sorting = np.zeros(m, np.bool_), np.empty((m, 2)), np.empty(m)
+    x, y, drifted, fastest, restless = 0.0, 0.0, False, 0.0, 0
     for f in range(n):
-        seen = np.isfinite(away[f, :, 0])
-        hold, last, trembles = away[f][stuck & seen], now, restless >= _RESTLESS
+        now = away[f]
+        last_x, last_y, trembles = x, y, restless >= _RESTLESS
+        for i in range(m):
+            seen[i] = np.isfinite(now[i, 0])
+            hold[i] = stuck[i] and seen[i]
+        held = _count(hold)
         anchored = False
-        if len(hold) >= ANCHORS:
-            near = _lengths(hold - _median(hold)) < _APART_PX
-            anchored = near.sum() >= max(ANCHORS, 0.5 * len(hold))
+        if held >= ANCHORS:
+            middle_x, middle_y = _median(now, hold, sorting)
+            for i in range(m):
+                near[i] = (
+                    hold[i] and _length(now[i, 0] - middle_x, now[i, 1] - middle_y) < _APART_PX
+                )
+                still[i] = hold[i] and _length(now[i, 0], now[i, 1]) < LEAST_PX
+            anchored = _count(near) >= max(ANCHORS, 0.5 * held)
             if anchored:
-                now = _median(hold[near])
-                still = _lengths(hold) < LEAST_PX
-                if _length(now) > LEAST_PX and still.sum() >= ANCHORS and not trembles:
+                x, y = _median(now, near, sorting)
+                if _length(x, y) > LEAST_PX and _count(still) >= ANCHORS and not trembles:
                     # papillae that do not touch move together, and are more than those that do
-                    near, now = still, _median(hold[still])
-                sigma[f] = np.sqrt(np.mean((hold[near] - now) ** 2))
-                drifted |= near.sum() >= MANY and _length(now) > LEAST_PX
-        if not anchored and seen.any():
+                    near[:] = still
+                    x, y = _median(now, still, sorting)
+                squares = 0.0
+                for i in range(m):
+                    if near[i]:
+                        squares += (now[i, 0] - x) * (now[i, 0] - x)
+                        squares += (now[i, 1] - y) * (now[i, 1] - y)
+                sigma[f] = np.sqrt(squares / (2 * _count(near)))
+                drifted |= _count(near) >= MANY and _length(x, y) > LEAST_PX
+        if not anchored and _count(seen) > 0:
             # innovations: of what stood still its place, of what slides its step
-            new = np.where(stuck[:, None], away[f], away[f] - before - velocity) - now
-            known = seen & np.isfinite(new[:, 0])
-            step = _median(new[known]) if known.sum() >= ANCHORS else np.zeros(2)
-            knock = _length(step) > KNOCK_PX
+            for i in range(m):
+                for c in range(2):
+                    if stuck[i]:
+                        new[i, c] = now[i, c]
+                    else:
+                        new[i, c] = now[i, c] - before[i, c] - velocity[i, c]
+                new[i, 0] -= x
+                new[i, 1] -= y
+                known[i] = seen[i] and np.isfinite(new[i, 0])
+            step_x, step_y = 0.0, 0.0
+            if _count(known) >= ANCHORS:
+                step_x, step_y = _median(new, known, sorting)
+            knock = _length(step_x, step_y) > KNOCK_PX
             if knock and fastest > KNOCK_PX and not trembles:
-                knock = _all_took(step, new, known, stuck, velocity)
+                knock = _all_took(step_x, step_y, new, known, stuck, velocity, sorting)
             if knock:
-                now = now + step
+                x, y = x + step_x, y + step_y
                 unsure[f] = True
-        shift[f] = now
-        restless += _length(now - last) > LEAST_PX
-        place = away[f] - now
-        gone = np.where(seen & (_lengths(place) > 2 * _APART_PX), gone + 1, 0)
-        stuck &= gone < _GONE_FRAMES
-        moved = np.where(np.isfinite(before), place - before, 0.0)
-        fastest = max(fastest, _lengths(moved).max())
-        velocity[seen] = _KEEP * velocity[seen] + (1 - _KEEP) * moved[seen]
-        before[seen] = place[seen]
+        shift[f, 0], shift[f, 1] = x, y
+        restless += _length(x - last_x, y - last_y) > LEAST_PX
+        quickest, whole = 0.0, True
+        for i in range(m):
+            at_x, at_y = now[i, 0] - x, now[i, 1] - y
+            gone[i] = gone[i] + 1 if seen[i] and _length(at_x, at_y) > 2 * _APART_PX else 0
+            stuck[i] = stuck[i] and gone[i] < _GONE_FRAMES
+            moved_x = at_x - before[i, 0] if np.isfinite(before[i, 0]) else 0.0
+            moved_y = at_y - before[i, 1] if np.isfinite(before[i, 1]) else 0.0
+            length = _length(moved_x, moved_y)
+            whole = whole and not np.isnan(length)
+            quickest = max(quickest, length)
+            if seen[i]:
+                velocity[i, 0] = _KEEP * velocity[i, 0] + (1 - _KEEP) * moved_x
+                velocity[i, 1] = _KEEP * velocity[i, 1] + (1 - _KEEP) * moved_y
+                before[i, 0], before[i, 1] = at_x, at_y
+        if whole:  # a marker that is lost leaves the largest motion open
+            fastest = max(fastest, quickest)
     return shift, unsure, sigma, drifted
 
 
 @njit(cache=True, nogil=True)
-def _all_took(step: Any, new: Any, known: Any, stuck: Any, velocity: Any) -> bool:
+def _all_took(
+    step_x: float, step_y: float, new: Any, known: Any, stuck: Any, velocity: Any, sorting: Any
+) -> bool:
     """Return whether a median step is the camera's: then all markers jump.
 
     It is asked once a marker has moved by more than a knock in a frame, as in slides above some
@@ -126,37 +164,57 @@ def _all_took(step: Any, new: Any, known: Any, stuck: Any, velocity: Any) -> boo
     Args:
         new, velocity: (m, 2) innovations, and motion per frame so far, px.
         known, stuck: (m,) markers with an innovation; those at rest.
+        sorting: (m,) room.
     """
-    standing = known & stuck
-    witnesses = standing if standing.any() else known
-    if np.mean(_lengths(new[witnesses]) < _APART_PX) >= _CALM_SHARE:
+    standing = 0
+    for i in range(len(known)):
+        standing += known[i] and stuck[i]
+    witnesses, calm = 0, 0
+    for i in range(len(known)):
+        if known[i] and (stuck[i] or standing == 0):
+            witnesses += 1
+            calm += _length(new[i, 0], new[i, 1]) < _APART_PX
+    if calm / witnesses >= _CALM_SHARE:
         return False
-    if standing.any():
+    if standing > 0:
         return True
-    common = _median(velocity[known])
-    speed = _length(common)
+    common_x, common_y = _median(velocity, known, sorting)
+    speed = _length(common_x, common_y)
     if speed <= _APART_PX:
         return True
-    slower = -(step[0] * common[0] + step[1] * common[1]) / speed
-    across = _length(step + slower * common / speed)
+    slower = -(step_x * common_x + step_y * common_y) / speed
+    across = _length(step_x + slower * common_x / speed, step_y + slower * common_y / speed)
     return not (across < _APART_PX and 0 < slower < speed + _APART_PX)
 
 
 @njit(cache=True, nogil=True)
-def _median(places: Any) -> Any:
-    """Median of each coordinate of (k, 2)."""
-    return np.array([np.median(places[:, 0]), np.median(places[:, 1])])
+def _median(places: Any, which: Any, sorting: Any) -> tuple[Any, Any]:
+    """Median of each coordinate of some of (m, 2) places; `sorting` is room."""
+    return _middle(places[:, 0], which, sorting), _middle(places[:, 1], which, sorting)
 
 
 @njit(cache=True, nogil=True)
-def _lengths(vectors: Any) -> Any:
-    """Lengths of (k, 2)."""
-    return np.hypot(vectors[:, 0], vectors[:, 1])
+def _middle(values: Any, which: Any, sorting: Any) -> Any:
+    k = 0
+    for i in range(len(which)):
+        if which[i]:
+            sorting[k] = values[i]
+            k += 1
+    sorting[:k].sort()
+    return 0.5 * (sorting[(k - 1) // 2] + sorting[k // 2])
 
 
 @njit(cache=True, nogil=True)
-def _length(vector: Any) -> float:
-    return np.hypot(vector[0], vector[1])
+def _count(which: Any) -> Any:
+    found = 0
+    for each in which:
+        found += each
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _length(x: Any, y: Any) -> Any:
+    return np.hypot(x, y)
 
 
 def no_shift(n: int) -> CameraShift:
