@@ -57,8 +57,9 @@ def _models_in(part: Schema, path: str, models: dict[str, Schema]) -> Iterator[t
 
 
 def _tag(model: Schema) -> str:
-    """The value that selects this model in a file: ``slide``, ``basler``."""
-    return next(str(field["const"]) for field in model["properties"].values() if "const" in field)
+    """The value that selects this model in a file: ``slide``, ``basler``; else its title."""
+    tags = (str(field["const"]) for field in model["properties"].values() if "const" in field)
+    return next(tags, str(model.get("title", "")))
 
 
 def _anchor(path: str) -> str:
