@@ -1,5 +1,1 @@
-"""`python -m sliplab`: the command line."""
-
-from sliplab.flows.__main__ import main
-
-main()
+../../sliplab/__main__.py
