@@ -122,14 +122,14 @@ def check_export(request: ExportRequest) -> Export:
             holders = [each for each in export_names() if name in known_export(each).options]
             text = f"does not belong to --as {request.form}; it is of {', '.join(holders)}"
             raise InputError(f"--{name}", "", None, text)
-    place, whose = Path(request.place), f"--as {request.form} is of {TITLES[form.of]}"
+    place, taken = Path(request.place), f"--as {request.form} is of {TITLES[form.of]}"
     if place.exists() and place.is_dir() == (form.of == "model"):
         there = "a folder" if place.is_dir() else "a file"
-        raise InputError("WHAT", "", request.place, f"is {there}, and {whose}")
+        raise InputError("WHAT", "", request.place, f"is {there}, and {taken}")
     if form.of == "trials" and not request.part:
-        raise InputError("PART", "", None, f"is needed: {whose}")
+        raise InputError("PART", "", None, f"is needed: {taken}")
     if form.of != "trials" and request.part:
-        raise InputError("PART", "", request.part, f"is too much: {whose}")
+        raise InputError("PART", "", request.part, f"is too much: {taken}")
     return form
 
 

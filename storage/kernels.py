@@ -31,13 +31,13 @@ COMPILING = "compiling once for this version; this takes up to some minutes"
 class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba has no types
     """Says on standard error when this process compiles its first kernel; workers say nothing."""
 
-    said = False
+    announced = False
 
     def on_start(self, event: Any) -> None:
-        if not self.said and parent_process() is None:
+        if not self.announced and parent_process() is None:
             with suppress(OSError, ValueError):  # closed, or its reader is gone
                 print(COMPILING, file=sys.stderr, flush=True)
-        self.said = True
+        self.announced = True
 
     def on_end(self, event: Any) -> None:
         pass

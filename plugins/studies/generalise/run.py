@@ -56,8 +56,8 @@ def measure_generalisation(
         epochs: of each training, instead of the protocol's.
 
     Returns:
-        all results that are kept. Named are the file that keeps them, the ``results`` that were
-        requested, and how many of these were ``made`` now; `Finding.more` has both.
+        all stored results. ``named`` has their file, the ``results`` that were requested, and how
+        many of these were ``made`` now; `Finding.more` has the requested ones and the file.
 
     Raises:
         StoreError: a trial has no label yet.
