@@ -24,7 +24,7 @@ PLAN = ("runs", "kept", "pending", "estimated_s")
 
 def measure(
     folder: Annotated[
-        Path | None, typer.Argument(metavar="STORE", help="A labelled store.", show_default=False)
+        str | None, typer.Argument(metavar="STORE", help="A labelled store.", show_default=False)
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Output folder; default: STORE/report.")
@@ -76,7 +76,7 @@ def measure(
     campaign: CampaignOption = None,
     reviewed: ReviewedOption = False,
     detector: Annotated[
-        Path | None, typer.Option("--detector", hidden=True, help="Former name of STORE.")
+        str | None, typer.Option("--detector", hidden=True, help="Former name of STORE.")
     ] = None,
     scene: Annotated[Path | None, typer.Option("--scene", hidden=True)] = None,
 ) -> Finding[DetectorTradeoff]:
@@ -93,7 +93,7 @@ def measure(
     place = folder or detector
     if place is None:
         raise InputError("STORE", "", None, "is needed: a labelled store")
-    store, campaigns = opened_campaigns(located(str(place)), campaign)
+    store, campaigns = opened_campaigns(located(place), campaign)
     from sliplab.plugins.studies.detector.run import tradeoff_detector
     from sliplab.plugins.studies.detector.search import SearchSize
 
