@@ -15,7 +15,6 @@ from sliplab.flows.planning.schema import DOCUMENTS, file_schema
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import DocumentError
 
-
 SOME = 100
 """Values of a document that take turns: each makes the whole of it be checked."""
 
