@@ -53,10 +53,10 @@ PROMISED = {
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
 }
-MARKS = dict.fromkeys(("scene", "fewer", "statements"), pytest.mark.long)
+MARKS = dict.fromkeys(("scene", "fewer", "statements", "orchestration"), pytest.mark.long)
 MARKS["acquisition"] = pytest.mark.realtime
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
-campaigns."""
+campaigns, and `orchestration` servers."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in TINY])
