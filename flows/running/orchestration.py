@@ -29,6 +29,8 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import masked
 
 if TYPE_CHECKING:
+    from uuid import UUID
+
     from sliplab.flows.running.cluster import Cluster
 
 T = TypeVar("T")
@@ -281,6 +283,21 @@ class ServerLink:
 
 class _NotSent(Exception):
     """A request was not sent, because the one before it failed."""
+
+
+def show_running(client: Any, run: UUID, name: str, message: str) -> None:
+    """Show on Prefect's page what a run that is running does; another state is left alone.
+
+    Args:
+        client: Prefect's, a synchronous one.
+        name: in place of "Running".
+    """
+    from prefect.states import Running
+
+    known = client.read_flow_run(run).state
+    if known is not None and known.is_running():
+        state: Any = Running(name=name, message=message)
+        client.set_flow_run_state(run, state, force=True)
 
 
 def is_unreachable() -> bool:

@@ -139,12 +139,10 @@ def when_free(
 def _report_waiting(run: Any, why: str) -> None:
     """Show on Prefect's page that a run waits for its rig."""
     from prefect.client.orchestration import get_client
-    from prefect.states import Running
 
     console.say(f"waiting: {why}")
     with suppress(Exception), get_client(sync_client=True) as client:
-        state: Any = Running(name="WaitingForRig", message=why)
-        client.set_flow_run_state(run.id, state, force=True)
+        orchestration.show_running(client, run.id, "WaitingForRig", why)
 
 
 def _words(error: Exception) -> str:
