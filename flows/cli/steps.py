@@ -18,6 +18,8 @@ from sliplab.flows.cli.common import (
     located,
     step,
 )
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import Rule
 from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
@@ -90,17 +92,11 @@ def train(
 
 
 @app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab evaluate my-store")
+@model_options
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
-    margin: Annotated[
-        float | None,
-        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
-    ] = None,
-    smoothing: Annotated[
-        int | None,
-        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
-    ] = None,
+    rule: Rule = Rule(),
     reviewed: ReviewedOption = False,
     baselines: Annotated[
         bool,
@@ -127,7 +123,7 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on the test trials."""
-    options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    options: dict[str, Any] = {**rule.model_dump(), "reviewed": reviewed}
     if model is None and engine is not None:
         raise InputError("--engine", "", engine.value, "belongs to --model")
     folder = located(store)

@@ -418,7 +418,8 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
             client = stack.enter_context(link.client())
             if _store is not None:
                 run_records.close_killed_runs(_store, link.server, client)
-            flow_run = client.create_flow_run(flow)
+            name = flow.name if _store is None else f"{flow.name} {_store.name}"
+            flow_run = client.create_flow_run(flow, name=name)
         except Exception as error:
             if cluster is not None:
                 raise ServerError(
