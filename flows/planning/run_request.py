@@ -178,7 +178,10 @@ def make_request(
         begun = found if found.begun else None
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
-    rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
+    if level and rig_file.simulated:
+        rig_file = at_level(rig_file, level)
+    else:
+        rig_file = with_level(rig_file, plan)
     run_request = RunRequest(
         plan,
         rig_file,
