@@ -328,22 +328,10 @@ class Store:
             campaign: needed where several campaigns have a trial of this id.
 
         Raises:
-            StoreError: it does not exist, or more than one.
+            NoTrial: it does not exist, or more than one; a StoreError and an InputError.
         """
-        found = [
-            item
-            for item in self._store.campaigns()
-            if campaign in (None, item.name) and trial_id in item.committed()
-        ]
-        if len(found) != 1:
-            where = ", ".join(item.name for item in found)
-            raise StoreError(
-                f"{self.folder}: trial {trial_id}: is in several campaigns ({where}): name one"
-                if found
-                else f"{self.folder}: trial {trial_id}: no such trial"
-                + ("" if campaign is None else f" in campaign {campaign}")
-            )
-        return Trial(self._store, found[0].name, found[0].recording(trial_id))
+        found = self._store.holder(trial_id, campaign)
+        return Trial(self._store, found.name, found.recording(trial_id))
 
     def __iter__(self) -> Iterator[Trial]:
         """All committed trials, by campaign and id."""

@@ -142,7 +142,7 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
     if part in campaigns:
         return opened, campaigns[part], sorted(campaigns[part].committed())
-    holders = [item for item in campaigns.values() if part in item.committed()]
+    holders = opened.holders(part)
     if len(holders) != 1:
         text = (
             "is in several campaigns; name a trial or another campaign"

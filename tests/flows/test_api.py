@@ -135,7 +135,7 @@ def test_a_step_runs_what_is_missing_only(folder: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_named(store: sliplab.Store, tmp_path: Path) -> None:
-    with pytest.raises(sliplab.StoreError, match="trial nothing: no such trial"):
+    with pytest.raises(sliplab.StoreError, match="nothing: is no committed trial of"):
         store.trial("nothing")
     with pytest.raises(sliplab.StoreError, match="has no video; its camera provided tracks"):
         store.trial(FIRST).frame(0)
