@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import DATA, JsonOption, finish, located
+from sliplab.flows.cli.common import DATA, JsonOption, finish
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
@@ -100,12 +99,9 @@ def export(
 
 def write(request: ExportRequest, as_json: bool) -> None:
     """Run an export and print its result."""
-    from sliplab.flows.exports import check_export
+    from sliplab.flows.exports import export as run
 
-    form = check_export(request)
-    if form.of != "model":
-        request = replace(request, place=str(located(request.place)))
-    done = form.write(request)
+    done = run(request)
     finish(done.result if as_json or done.pairs is None else done.pairs, done.title, as_json)
 
 
