@@ -26,6 +26,7 @@ EXTRAS = {
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
     "formats": ("faery", "rosbags"),
+    "xarray": ("xarray",),
 }
 """Modules that each extra installs."""
 

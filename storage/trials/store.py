@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NotRequired, TypedDict, cast
 
-from sliplab.storage.errors import NoStore, StoreError, masked, translated_disk_errors
+from sliplab.storage.errors import NoStore, NoTrial, StoreError, masked, translated_disk_errors
 from sliplab.storage.files import (
     inside,
     json_text,
@@ -474,6 +474,30 @@ class Store:
             for path in sorted(folder.iterdir())
             if not path.is_symlink() and (path / INFO).is_file()
         ]
+
+    def holders(self, trial: str, campaign: str | None = None) -> list[Campaign]:
+        """Return the campaigns, or that of the name, that have a committed trial of this id."""
+        named = (item for item in self.campaigns() if campaign in (None, item.name))
+        return [item for item in named if trial in item.committed()]
+
+    def holder(self, trial: str, campaign: str | None = None) -> Campaign:
+        """Return the campaign of a committed trial.
+
+        Args:
+            campaign: its name; needed where several have a trial of this id.
+
+        Raises:
+            NoTrial: there is no such trial, or more than one.
+        """
+        found = self.holders(trial, campaign)
+        if len(found) > 1:
+            names = ", ".join(item.name for item in found)
+            raise NoTrial(trial, f"is in {names}; name one with --campaign")
+        if not found:
+            where = str(self.folder) if campaign is None else f"campaign '{campaign}'"
+            listed = f"`sliplab trials {self.folder}` lists them"
+            raise NoTrial(trial, f"is no committed trial of {where}; {listed}")
+        return found[0]
 
     @property
     def simulated(self) -> bool:
