@@ -36,6 +36,8 @@ from sliplab.storage.streams import (
     F64,
     FRAMES_KIND,
     I64,
+    SCALAR,
+    WRENCH,
     PathSegment,
     ScalarChunk,
     WrenchChunk,
@@ -151,12 +153,12 @@ def assess(
         readings = {
             name: reader.scalars(name)
             for name, about in further.items()
-            if about.kind == ScalarChunk.KIND
+            if about.kind == SCALAR.name
         }
         loads = {
             name: reader.wrenches(name)
             for name, about in further.items()
-            if about.kind == WrenchChunk.KIND
+            if about.kind == WRENCH.name
         }
         wrenches = reader.wrenches(FORCE) if FORCE in named and to_plate is not None else None
     sync = synchronise(streams, timing, rate_hz, with_events=with_events)
@@ -181,7 +183,7 @@ def assess(
         figures = _force_figures(wrenches, to_plate, sync, motion)
         results |= _force_gates(figures, gates)
         named[FORCE] = StreamRecord(
-            kind=wrenches.KIND, rows=len(wrenches), to_plate=to_plate, figures=figures
+            kind=WRENCH.name, rows=len(wrenches), to_plate=to_plate, figures=figures
         )
     elif gates.normal_force is not None or gates.hold_force is not None:
         results |= _force_gates({}, gates)
@@ -192,7 +194,7 @@ def assess(
                     name, about, reader, streams, sync, motion, gates, rate_hz
                 )
             results |= gated
-        elif about.kind == WrenchChunk.KIND:
+        elif about.kind == WRENCH.name:
             rows: dict[str, Any] = {"rows": len(loads[name])}
             if about.to_plate is not None:
                 figures = _force_figures(loads[name], about.to_plate, sync, motion, name)

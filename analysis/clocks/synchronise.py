@@ -35,7 +35,7 @@ from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTimi
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.trial import DeviceRecord, StreamRecord, TrialClockMaps
-from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, WrenchChunk
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, WRENCH
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
@@ -199,7 +199,7 @@ def further_clock(name: str, about: StreamRecord, reader: StreamReader) -> Furth
     pulses, reads, samples = none, ClockReadings(none, none, none), None
     if about.kind == EVENTS_KIND:
         pulses = reader.column("event_pulses/t")
-    elif about.kind == WrenchChunk.KIND:
+    elif about.kind == WRENCH.name:
         wrenches = reader.wrenches(name)
         samples = wrenches.t_ns, wrenches.host_ns
     elif about.kind == FRAMES_KIND:
@@ -256,7 +256,7 @@ def streams_of(
         wrenches={
             name: (column(f"{STREAM_GROUP}/{name}/t"), column(f"{STREAM_GROUP}/{name}/host"))
             for name, kind in reader.streams().items()
-            if kind == WrenchChunk.KIND and name not in (further or {})
+            if kind == WRENCH.name and name not in (further or {})
         },
         further=dict(further or {}),
     )

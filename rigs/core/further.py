@@ -94,15 +94,15 @@ class FurtherEvents(_Further):
         """Read what has come."""
         with self._named():
             events, pulses = self.device.read(), self.device.read_pulses()
-        sink.add_stream(self.name, events)
-        sink.add_stream(self.name, pulses)
+        sink.add(self.name, events)
+        sink.add(self.name, pulses)
 
     def finish(self, sink: Sink) -> None:
         """Stop, and read late pulses, as of the first event camera."""
         with self._named():
             self.device.stop()
             pulses = self.device.read_pulses()
-        sink.add_stream(self.name, pulses)
+        sink.add(self.name, pulses)
 
 
 @dataclass(frozen=True)
@@ -118,16 +118,16 @@ class FurtherFrames(_Further):
             timing = self.about.timing
             by_reads = timing is not None and timing.grade == "device time stamps"
             reads = self.device.read_clock() if by_reads else None
-        sink.add_stream(self.name, frames)
+        sink.add(self.name, frames)
         if reads is not None:
-            sink.add_stream(self.name, reads)
+            sink.add(self.name, reads)
 
     def finish(self, sink: Sink) -> None:
         """Stop, and read the frames that were exposed before."""
         with self._named():
             self.device.stop()
             frames = self.device.read()
-        sink.add_stream(self.name, frames)
+        sink.add(self.name, frames)
 
 
 @dataclass(frozen=True)
@@ -145,14 +145,14 @@ class FurtherScalars(_Further):
         """Read what has come."""
         with self._named():
             readings = self.device.read()
-        sink.add_stream(self.name, readings)
+        sink.add(self.name, readings)
 
     def finish(self, sink: Sink) -> None:
         """Stop, and read what was sent before."""
         with self._named():
             self.device.stop()
             readings = self.device.read()
-        sink.add_stream(self.name, readings)
+        sink.add(self.name, readings)
 
 
 @dataclass(frozen=True)
@@ -176,14 +176,14 @@ class FurtherForces(_Further):
         """Read what has come."""
         with self._named():
             forces = self.device.read()
-        sink.add_stream(self.name, forces)
+        sink.add(self.name, forces)
 
     def finish(self, sink: Sink) -> None:
         """Stop, and read what was sent before."""
         with self._named():
             self.device.stop()
             forces = self.device.read()
-        sink.add_stream(self.name, forces)
+        sink.add(self.name, forces)
 
 
 FurtherStream = FurtherEvents | FurtherFrames | FurtherForces | FurtherScalars

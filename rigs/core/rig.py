@@ -61,7 +61,7 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import POLL_S, QUIET_S, NoiseWatch, RateTouch, count_central
-from sliplab.storage.streams import EventChunk, Json, PathSegment, Sink, StepTimes
+from sliplab.storage.streams import EventChunk, ExposureChunk, Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 """Speed of moves that no protocol names; a rig's lower limit applies."""
@@ -748,7 +748,7 @@ class Rig:
             if self._forces is not None:
                 forces = self._forces.read()
                 if sink is not None:
-                    sink.add_stream(FORCE, forces)
+                    sink.add(FORCE, forces)
             if self._motion is not None:
                 self._look(self._motion)
             elif resting is not None:  # no motion was sent, but another program may send one
@@ -807,38 +807,38 @@ class Rig:
         self.wait(self.tail_s, sink)
         if self._streaming is not None:
             self._streaming.stop()
-            sink.add_event_pulses(self._streaming.read_pulses())
+            sink.add("events", self._streaming.read_pulses())
         if self.force is not None:
             self._forces = None
             self.force.stop()
-            sink.add_stream(FORCE, self.force.read())
+            sink.add(FORCE, self.force.read())
         if with_frames:
             self.frames.stop()
-            sink.add_frames(self.frames.read())
+            sink.add("frames", self.frames.read())
         for device in self._reading:
             device.finish(sink)
         self._reading = ()
 
     def _drain(self, sink: Sink) -> None:
         if self._streaming is not None:
-            sink.add_events(self._streaming.read())
-            sink.add_event_pulses(self._streaming.read_pulses())
+            sink.add("events", self._streaming.read())
+            sink.add("events", self._streaming.read_pulses())
         poses = self.arm.read_poses()
         if not (np.isfinite(poses.xyz_mm).all() and np.isfinite(poses.rotvec_deg).all()):
             raise ArmFault("arm", "reports poses that are not finite; check its controller's state")
-        sink.add_poses(poses)
-        sink.add_arm_pulses(self.arm.read_pulses())
-        sink.add_sync_pulses(self.sync.read_pulses())
+        sink.add("arm", poses)
+        sink.add("arm", self.arm.read_pulses())
+        sink.add("sync_box", self.sync.read_pulses())
         if self.frame_camera is not None:
-            sink.add_frames(self.frame_camera.read())
+            sink.add("frames", self.frame_camera.read())
         if self.timing.frames == "exposure line":
-            sink.add_exposures(self.sync.read_exposures())
+            sink.add("sync_box", ExposureChunk(self.sync.read_exposures().t_ns))
         if self._through_host:
-            sink.add_box_reads(self.sync.read_clock())
+            sink.add("sync_box", self.sync.read_clock())
         if self.timing.frames == "device time stamps" and self.frame_camera is not None:
-            sink.add_frame_camera_reads(self.frame_camera.read_clock())
+            sink.add("frames", self.frame_camera.read_clock())
         if (forces := self._forces or self.force) is not None:
-            sink.add_stream(FORCE, forces.read())
+            sink.add(FORCE, forces.read())
         for device in self._reading:
             device.drain(sink)
 

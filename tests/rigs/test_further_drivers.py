@@ -115,8 +115,8 @@ def test_a_scalar_sensor_of_a_package_is_read(install: Install, tmp_path: Path) 
     got: list[ScalarChunk] = []
 
     class Sink(NullSink):
-        def add_stream(self, name: str, chunk: Any) -> None:
-            assert name == "warm"
+        def add(self, device: str, chunk: Any) -> None:
+            assert device == "warm"
             got.append(chunk)
 
     device.connect()
