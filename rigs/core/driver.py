@@ -190,7 +190,7 @@ class FrameCameraDriver(Driver[SettingsT]):
     """Open the device, not grabbing yet, with its scale in px per mm. Raises RigError."""
     fake: Callable[[SettingsT, float, SceneFrames, int], FrameCamera] | None = None
     """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
-    unplug: Callable[[FrameCamera], None] | None = None
+    unplug: Callable[[Any], None] | None = None
     """Unplug a camera that `fake` has opened, for tests."""
     grade: FrameGrade = "hardware trigger"
     """Timing of frames on a loopback rig: `host arrival` where the camera is free-running."""
