@@ -31,7 +31,7 @@ from sliplab.protocols.yaml_file import (
     read_text,
     without_secrets,
 )
-from sliplab.rigs.levels import at_level, with_level
+from sliplab.rigs.mock.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
