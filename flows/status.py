@@ -27,7 +27,7 @@ from sliplab.storage.files import read_json
 from sliplab.storage.process import named
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.checksums import PROVENANCE
+from sliplab.storage.trials.checksums import PROVENANCE, incomplete
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
 from sliplab.storage.trials.store import IMPORTED, Campaign, Store
 
@@ -117,6 +117,7 @@ class StoreStatus:
 
     Attributes:
         running: the program that holds the store, in words; None if none does.
+        since: when it took the store, UTC.
         collects: name of the campaign that it takes trials for; None if it takes none.
         paused: who paused the store, when and why, in words; None if it is not paused.
         disk_free: bytes, without the reserve that a collection keeps.
@@ -125,6 +126,7 @@ class StoreStatus:
 
     store: str
     running: str | None
+    since: str | None
     collects: str | None
     paused: str | None
     disk_free: int
@@ -132,14 +134,22 @@ class StoreStatus:
     imported: list[str]
 
 
+@dataclass(frozen=True)
+class _TrialFolder:
+    """When a committed trial ended, if that is known, and its bytes on disk."""
+
+    ended: datetime | None
+    bytes: int
+
+
 class StatusReader:
     """Reads the state of a store again and again; what cannot change is read once."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._ended: dict[Path, datetime | None] = {}
-        self._bytes: dict[Path, int] = {}
+        self._known: dict[tuple[Path, int], _TrialFolder] = {}
         self._drift: dict[tuple[str, ...], list[Drift]] = {}
+        self._plans: dict[tuple[Path, int], Plan] = {}
 
     def read(self, now: datetime | None = None) -> StoreStatus:
         """Return the state.
@@ -163,6 +173,7 @@ class StatusReader:
         return StoreStatus(
             store=str(self._store.folder),
             running=None if holder is None else named(holder),
+            since=None if holder is None else holder.get("since"),
             collects=None if holder is None else holder.get("collects") or None,
             paused=None if paused is None else str(paused),
             disk_free=free,
@@ -173,18 +184,24 @@ class StatusReader:
     def _campaign(self, campaign: Campaign, free: int, now: datetime) -> CampaignStatus:
         simulated = bool(campaign.info["simulated"])
         try:
-            plan = Collected(campaign).plan
-            committed = campaign.committed()
+            plan = self._plan(campaign)
+            folders = self._folders(campaign)
+            committed = set(folders)
             excluded = excluded_trials(plan, campaign, committed)
             done = [trial for trial in plan if trial.id in committed]
             out = {item["trial"] for item in excluded}
             missing = [t for t in plan if t.id not in committed and t.id not in out]
-            ended = self._ends(campaign, [trial.id for trial in done], now)
+            ended = {
+                trial.id: moment.astimezone(now.tzinfo)
+                for trial in done
+                if (moment := folders[trial.id].ended) is not None
+            }
             by_night = Counter(night_of(moment) for moment in ended.values())
             tonight = by_night.get(night_of(now), 0)
             nights = [by_night[night] for night in sorted(by_night)]
             over = nights[:-1] if tonight and len(nights) > 1 else nights
-            size = self._size(campaign, [trial.id for trial in done[-LOOK_BACK:]])
+            sizes = [folders[trial.id].bytes for trial in done[-LOOK_BACK:]]
+            size = round(median(sizes)) if sizes else None
             pace = pace_of(plan, ended)
             left = sum(plan.seconds(trial) for trial in missing)
             a_night = mean(over) if over else 0.0
@@ -207,28 +224,26 @@ class StatusReader:
         except (InputError, StoreError) as error:
             return CampaignStatus(campaign.name, simulated, problem=str(error))
 
-    def _ends(
-        self, campaign: Campaign, trials: Sequence[str], now: datetime
-    ) -> dict[str, datetime]:
-        """Return when trials ended, local time; those that do not say are left out."""
-        found = {}
-        for trial in trials:
-            path = campaign.folder / "trials" / trial / PROVENANCE
-            if path not in self._ended:
-                self._ended[path] = _moment(path)
-            moment = self._ended[path]
-            if moment is not None:
-                found[trial] = moment.astimezone(now.tzinfo)
-        return found
+    def _plan(self, campaign: Campaign) -> Plan:
+        try:
+            key = campaign.protocol_file, campaign.protocol_file.stat().st_mtime_ns
+        except OSError as error:
+            raise StoreError(str(error)) from None
+        if key not in self._plans:
+            self._plans[key] = Collected(campaign).plan
+        return self._plans[key]
 
-    def _size(self, campaign: Campaign, trials: Sequence[str]) -> int | None:
-        sizes = []
-        for trial in trials:
-            folder = campaign.folder / "trials" / trial
-            if folder not in self._bytes:
-                self._bytes[folder] = sum(p.stat().st_size for p in folder.iterdir() if p.is_file())
-            sizes.append(self._bytes[folder])
-        return round(median(sizes)) if sizes else None
+    def _folders(self, campaign: Campaign) -> dict[str, _TrialFolder]:
+        """Return the complete trials by id; each folder is read once, as it never changes."""
+        found = {}
+        for path in campaign.folders("trials"):
+            key = path, path.stat().st_ino  # a trial that is taken again is another folder
+            if key not in self._known and incomplete(path) is None:
+                size = sum(each.stat().st_size for each in path.iterdir() if each.is_file())
+                self._known[key] = _TrialFolder(_moment(path / PROVENANCE), size)
+            if key in self._known:
+                found[path.name] = self._known[key]
+        return found
 
     def _drifts(self, plan: Plan, campaign: Campaign, committed: set[str]) -> list[Drift]:
         known = [t.id for t in plan if t.role == "reference" and t.id in committed]

@@ -47,8 +47,8 @@ def status(
     _print(found)
     while watch:
         stopping.wait(EVERY_S)
-        shown, found = _lines(found), reader.read()
-        if _lines(found) != shown:
+        shown, found = state_lines(found), reader.read()
+        if state_lines(found) != shown:
             _print(found)
 
 
@@ -101,11 +101,11 @@ def log(
 
 
 def _print(status: StoreStatus) -> None:
-    for line in _lines(status):
+    for line in state_lines(status):
         console.show(line)
 
 
-def _lines(status: StoreStatus) -> list[str]:
+def state_lines(status: StoreStatus) -> list[str]:
     """Return the state in words, a line each."""
     from sliplab.protocols.shown import plural
 
