@@ -148,10 +148,10 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
 def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4")
     file, store = str(tmp_path / "a.aedat4"), str(tmp_path / "store")
-    found = loaded("import", file, "--store", store, "--name", "a")
+    (found,) = loaded(("import", file, "--store", store, "--name", "a"))
     assert "sliplab.plugins.formats.lab.layout" in found  # a run's folder may lie around the file
     for name in ("prophesee", "event_stream", "ros.mcap", "ros.bags", "lerobot"):
         assert f"sliplab.plugins.formats.{name}" not in found
     out = str(tmp_path / "out")
-    found = loaded("export", store, "a", "--format", "aedat4", "--output", out)
+    (found,) = loaded(("export", store, "a", "--format", "aedat4", "--output", out))
     assert not [name for name in found if name.startswith("sliplab.plugins.formats.")]
