@@ -59,6 +59,8 @@ def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[st
     out, said = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", words)
+        # Prefect's set-up ends all handlers: that of absl would close what it took for its stream
+        patch.setattr("logging.shutdown", lambda *_: None)
         patch.chdir(cwd)
         with (
             contextlib.redirect_stdout(out),
