@@ -14,6 +14,7 @@ from sliplab.flows.cli.common import (
     StoreOption,
     finish,
     new_store,
+    path_only,
     say_faults,
 )
 from sliplab.flows.running import console, exit_codes
@@ -68,6 +69,8 @@ def import_(
     labels and factors, from a folder or .zip, as a campaign to train and evaluate on
     (docs/adapters.md).
     """
+    for given_path in (path, Path(kind_or_path)):
+        path_only("PATH")(given_path)
     if adapter is not None:
         for option, given in (("KIND", path is not None), ("--simulated", simulated)):
             if given:
