@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import Field
 
-from sliplab.flows.cli.common import DATA, JsonOption, finish, located
+from sliplab.flows.cli.common import DATA, JsonOption, finish
 from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
@@ -92,12 +91,9 @@ def export(
 
 def write(request: ExportRequest, as_json: bool) -> None:
     """Run an export and print its result."""
-    from sliplab.flows.exports import check_export
+    from sliplab.flows.exports import export as run
 
-    form = check_export(request)
-    if form.of != "model":
-        request = replace(request, place=str(located(request.place)))
-    done = form.write(request)
+    done = run(request)
     finish(done.result if as_json or done.pairs is None else done.pairs, done.title, as_json)
 
 

@@ -175,7 +175,7 @@ def clean_up(store: Store) -> None:
     """Delete the temporary files that killed programs left outside the campaigns."""
     sweep_temporary(store.folder)
     sweep_temporary(store.folder / control.FOLDER)
-    for name in ("models", "report", "derived", "review", "pulled"):
+    for name in ("models", "report", "derived", "review", "log", "pulled"):
         folder = store.folder / name
         for path in (folder, *folder.rglob("*")):
             if path.is_dir():

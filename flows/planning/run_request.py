@@ -31,7 +31,7 @@ from sliplab.protocols.yaml_file import (
     read_text,
     without_secrets,
 )
-from sliplab.rigs.levels import at_level, with_level
+from sliplab.rigs.mock.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
@@ -178,7 +178,10 @@ def make_request(
         begun = found if found.begun else None
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
-    rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
+    if level and rig_file.simulated:
+        rig_file = at_level(rig_file, level)
+    else:
+        rig_file = with_level(rig_file, plan)
     run_request = RunRequest(
         plan,
         rig_file,

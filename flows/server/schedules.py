@@ -246,6 +246,8 @@ class _File(StrictModel):
 
     timezone: Zone
     schedules: list[dict[str, Any]]
+    alerts: dict[str, Any] | None = None
+    """`sliplab alerts` reads it."""
 
 
 def load_schedules(path: Path) -> list[Scheduled]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.analysis.study import Finding, Study
-from sliplab.flows.cli.common import CampaignOption, PlaceArgument, located, opened_campaigns
+from sliplab.flows.cli.common import CampaignOption, PlaceArgument, opened_campaigns
+from sliplab.flows.steps import located
 from sliplab.plugins.studies.generalise.document import (
     GeneralisationResults,
     NotTrained,
