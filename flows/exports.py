@@ -160,11 +160,11 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     holders = opened.holders(part)
     if len(holders) != 1:
         text = (
-            "is in several campaigns; name a trial or another campaign"
+            f"is in several campaigns of {folder}; name a trial or another campaign"
             if holders
-            else f"is no campaign or committed trial; campaigns: {', '.join(campaigns)}"
+            else f"is no campaign or committed trial of {folder}; campaigns: {', '.join(campaigns)}"
         )
-        raise InputError(folder, "", part, text)
+        raise InputError("PART", "", part, text)
     return opened, holders[0], [part]
 
 

@@ -103,12 +103,7 @@ def _verify_pushed(url: str, quarantine: bool) -> Verified:
     from sliplab.storage.remote.verify import verify_remote
 
     with console.bar(f"verify {url} (trials)", 0) as bar:
-
-        def seen(name: str) -> None:
-            bar.extend(1)
-            bar.advance(1, name)
-
-        trials, problems = verify_remote(Remote(url), seen, lambda _: stopping.check())
+        trials, problems = verify_remote(Remote(url), bar.count, lambda _: stopping.check())
     damaged = _damaged(problems)
     return {
         "url": url,

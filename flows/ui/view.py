@@ -22,10 +22,9 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -42,7 +41,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import RATE_NS, event_rate
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
-from sliplab.storage.process import start_tethered
+from sliplab.storage.process import Child, start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, SCALAR, WRENCH, EventChunk
 from sliplab.storage.trials import review
@@ -135,7 +134,7 @@ passes the file to any program that listens on its usual port, maybe another use
 
 
 @contextmanager
-def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[Child]:
     """Run Rerun's program while the block runs; nothing of it is left afterwards.
 
     It has its own session, because it starts another program, which outlives it otherwise.
@@ -145,13 +144,7 @@ def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.
     try:
         yield process
     finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(10)
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait(10)
+        process.stop(10, group=True)
 
 
 def program() -> str:
