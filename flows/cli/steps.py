@@ -17,6 +17,8 @@ from sliplab.flows.cli.common import (
     finish,
     step,
 )
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import Rule
 from sliplab.flows.running import console
 from sliplab.flows.steps import located, run_step
 from sliplab.protocols.shown import plural
@@ -88,17 +90,11 @@ def train(
 
 
 @app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab evaluate my-store")
+@model_options
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
-    margin: Annotated[
-        float | None,
-        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
-    ] = None,
-    smoothing: Annotated[
-        int | None,
-        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
-    ] = None,
+    rule: Rule = Rule(),
     reviewed: ReviewedOption = False,
     baselines: Annotated[
         bool,
@@ -138,8 +134,8 @@ def evaluate(
     done = run_evaluation(
         located(store),
         campaign,
-        margin=margin,
-        smoothing=smoothing,
+        margin=rule.margin,
+        smoothing=rule.smoothing,
         reviewed=reviewed,
         baselines=baselines,
         checks=checks,

@@ -21,6 +21,7 @@ EXTRAS = {
     "learn": ("torch", "sinabs", "sklearn", "threadpoolctl"),
     "prefect": ("prefect",),
     "report": ("matplotlib", "jinja2", "bokeh"),
+    "alerts": ("apprise",),
     "cluster": ("distributed", "prefect_dask"),
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),

@@ -44,14 +44,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import (
-    EVENTS_KIND,
-    FRAMES_KIND,
-    I64,
-    EventChunk,
-    ScalarChunk,
-    WrenchChunk,
-)
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, SCALAR, WRENCH, EventChunk
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
@@ -319,16 +312,16 @@ def _further(to: _Columns, recording: Recording) -> None:
         elif about.kind == FRAMES_KIND:
             _pictures(to, recording, name, path)
             to.sent[count] = about.rows
-        elif about.kind == WrenchChunk.KIND and recording.record.imported is not None:
+        elif about.kind == WRENCH.name and recording.record.imported is not None:
             wrench = recording.wrenches(name)
             time_ns = np.asarray(recording.clock(name).to_reference(wrench.t_ns))
             for axis, values in zip("xyz", wrench.force_n.T, strict=True):
                 to.scalars(f"{path}/f{axis}", time_ns, values, count if axis == "x" else "")
-        elif about.kind == WrenchChunk.KIND and about.timing is not None:
+        elif about.kind == WRENCH.name and about.timing is not None:
             forces = plate_forces(recording, name)
             to.scalars(f"{path}/normal", forces.t_ns, forces.normal_n, count)
             to.scalars(f"{path}/tangential", forces.t_ns, forces.tangential_n)
-        elif about.kind == ScalarChunk.KIND:
+        elif about.kind == SCALAR.name:
             found = recording.scalars(name)
             time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
             to.once(path, to.rr.SeriesLines(names=f"{name} ({found.unit})"))
@@ -512,7 +505,7 @@ def blueprint(
     """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
-    curves_of = _named(further, ScalarChunk.KIND, WrenchChunk.KIND)
+    curves_of = _named(further, SCALAR.name, WRENCH.name)
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (

@@ -9,6 +9,7 @@
     STORE/campaigns/NAME/registrations/  what was registered before the first trial, one file a time
     STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
     STORE/control/                       requests of people (`storage.trials.control`)
+    STORE/log/                           notes of people (`flows.log`)
     STORE/review/                        decisions about labels (`storage.trials.review`)
     STORE/derived/ models/ report/       results of analysis; may be deleted at any time
     STORE/before/                        copies of what a migration changed
@@ -68,7 +69,7 @@ ADAPTER = "adapter"
 AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
 counted."""
-_FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
+_FOLDERS = ("campaigns", "control", "log", "derived", "models", "report", "before")
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
