@@ -620,22 +620,29 @@ def collect(
         sliplab.CampaignStopped: collection cannot continue; the message says why.
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
-    from sliplab.flows.planning.run_request import SessionMetadata, make_request
+    from pydantic import ValidationError
+
+    from sliplab.flows.planning.parameters import CollectOptions
+    from sliplab.flows.planning.run_request import make_request
     from sliplab.flows.running import extras, stopping
     from sliplab.flows.steps import prepare_store
+    from sliplab.protocols.key_errors import faults_of
 
-    if trials is not None and trials < 1:
-        raise InputError("trials", "", trials, "must be 1 or more")
-    run_request = make_request(
-        Path(protocol),
-        Path(rig),
-        Path(store),
-        enable=tuple(enable),
-        campaign=campaign,
-        metadata=SessionMetadata(operator, temperature, humidity, note),
-        most=trials,
-        claims="overrule" if no_stopping else "use",
-    )
+    try:
+        options = CollectOptions(
+            enable=list(enable),
+            trials=trials,
+            campaign=campaign,
+            operator=operator,
+            temperature_c=temperature,
+            humidity_percent=humidity,
+            note=note,
+            no_stopping=no_stopping,
+        )
+    except ValidationError as error:
+        fault = faults_of(CollectOptions, error)[0]
+        raise InputError(fault.key, "", fault.value, str(fault)) from None
+    run_request = make_request(Path(protocol), Path(rig), Path(store), **options.arguments())
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)
         from sliplab.flows.collect import collect as take
