@@ -120,11 +120,11 @@ def judge_predictions(
         InputError: the table; all its faults at once.
         StoreError: a trial has no label yet.
     """
-    from sliplab.analysis.evaluation.predictions import predicted
+    from sliplab.analysis.evaluation.predictions import prediction_judgement
 
     need_slip(campaigns)
     labels = StoreLabels(store, reviewed)
-    return _scores(predicted(labels, campaigns, predictions, margin, smoothing), cluster)
+    return _scores(prediction_judgement(labels, campaigns, predictions, margin, smoothing), cluster)
 
 
 def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
