@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args
 
 from sliplab.analysis.metrics.intervals import STATISTICS
+from sliplab.analysis.report.outcomes import lost_ms
 from sliplab.storage.schema.summary import GrossOutcome, Outcome
 from sliplab.storage.streams import Json
 
@@ -56,12 +57,6 @@ _BY_NAME = {
 _LEVELS = ("seed", "tenth", "lead", "to", "stride_ms", "asked", "allowed", "ms")
 """Keys by which the rows of a list are told apart; they go into the condition."""
 _OUTCOMES = {"outcome": get_args(Outcome), "gross": get_args(GrossOutcome)}
-_LOST = {
-    "latency_incipient_ms": ("outcome", math.inf),
-    "latency_gross_ms": ("gross", math.inf),
-    "lead_ms": ("outcome", -math.inf),
-}
-"""Outcome that decides whether a trial's time is lost, and the value that it then has."""
 _TIMES = {"latency_incipient_ms": "latency_ms.incipient", "latency_gross_ms": "latency_ms.gross"}
 """Figures of times that have another name among the intervals."""
 _ONSETS = ("incipient", "gross")
@@ -165,8 +160,8 @@ def _part(at: Row, part: Mapping[str, Any]) -> Iterator[Row]:
         if key == main:
             ends = {end: math.nan if part[end] is None else part[end] for end in ("low", "high")}
             yield _row({**at, **ends}, "" if key in _MAIN[:2] else key, value)
-        elif value is None and part.get(_LOST.get(key, ("",))[0]) in ("missed", "late"):
-            yield _row(at, key, _LOST[key][1])
+        elif value is None and (lost := lost_ms(part, key)) is not None:
+            yield _row(at, key, lost)
         else:
             for row in _entry(at, key, value):
                 yield row | spans.pop(row["figure"].removeprefix(f"{at['figure']}."), {})
