@@ -276,10 +276,17 @@ class Store:
         Raises:
             StoreError: there is no report yet.
         """
-        path = self.folder / "report" / "summary.json"
-        if not path.exists():
-            raise StoreError(f"{path}: does not exist; run `Store.report` first")
-        return read_json(path)
+        return read_json(self._reported("summary.json"))
+
+    def scores(self) -> pd.DataFrame:
+        """The figures of the last report and its trials' results, a row each (docs/summary.md).
+
+        Raises:
+            StoreError: there is no report yet, or it is of an older version.
+        """
+        import pandas as pd
+
+        return pd.read_parquet(self._reported("scores.parquet"))
 
     def models(self) -> list[Path]:
         """Files of the networks that were trained here."""
@@ -310,6 +317,12 @@ class Store:
             for item in self._store.campaigns()
         ]
         return table_html(f"Store {self.folder}", ("campaign", "trials", "simulated"), rows)
+
+    def _reported(self, name: str) -> Path:
+        path = self.folder / "report" / name
+        if not path.exists():
+            raise StoreError(f"{path}: does not exist; run `Store.report` first")
+        return path
 
     def _run(self, step: str, campaigns: Sequence[str] | None) -> StepResult:
         from sliplab.flows.running import extras, stopping

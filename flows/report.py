@@ -1,4 +1,4 @@
-"""`sliplab report`: `report/index.html` for people and `report/summary.json` for programs.
+"""`sliplab report`: `report/index.html` for people; `summary.json`, `scores.parquet` for programs.
 
 Every figure is also written as `report/figures/NAME.svg`, its data as
 `report/data/NAME.csv`; the page needs neither, nor anything else.
@@ -13,7 +13,7 @@ from prefect import flow
 
 from sliplab.analysis.campaigns import Collected, missing_stream, of_classes
 from sliplab.analysis.report import against as comparison
-from sliplab.analysis.report import classes, one_camera
+from sliplab.analysis.report import classes, one_camera, scores
 from sliplab.analysis.report import report as content
 from sliplab.analysis.report.marker_network import read_judged
 from sliplab.analysis.report.page import write_figures
@@ -24,12 +24,11 @@ from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.steps import StepResult
-from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json, write_json, write_text
-from sliplab.storage.schema.document import DocumentError
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.catalogue import write_table
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -48,8 +47,8 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
         key = one_camera.one_camera_key(store, campaigns)
     else:
         key = report_key(store, campaigns)
-    page = report_folder(store) / "index.html"
-    stale = not Derived.of(store, STEP).fresh(STEP, key) or not page.exists()
+    there = [(report_folder(store) / name).exists() for name in ("index.html", scores.FILE)]
+    stale = not Derived.of(store, STEP).fresh(STEP, key) or not all(there)
     if stale:
         run(report_flow, Opaque((store, campaigns, key)))
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
@@ -57,7 +56,7 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
 
 @flow(name="report", validate_parameters=False, persist_result=False)
 def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
-    """Write the report's page, then its summary."""
+    """Write the report's page, then its table of scores and its summary."""
     store, campaigns, key = argument.content
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
@@ -66,6 +65,12 @@ def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
             numbers = write_class_page(store, campaigns)
         else:
             numbers = _write_page(store, campaigns)
+    conditions = {
+        (item.name, trial.id): item.describe(trial)
+        for item in campaigns
+        for trial, _ in item.trials
+    }
+    write_table(scores.score_table(numbers, conditions), folder / scores.FILE)
     write_json(folder / SUMMARY, {**numbers, "timing_s": step_seconds(store)})
     Derived.of(store, STEP).write(STEP, key, {})
 
@@ -129,14 +134,8 @@ def against(store: Store, other: Path) -> tuple[comparison.ReportComparison, Pat
     Raises:
         InputError: there is no such report.
     """
-    try:
-        here = read_summary(store)
-    except DocumentError:
-        why = comparison.not_compared(report_folder(store) / SUMMARY)
-        if why is None:
-            raise
-        raise InputError("STORE", "", str(store.folder), why) from None
-    compared = comparison.compare(here, comparison.load_other(other))
+    here = comparison.load_report(store.folder, "STORE")
+    compared = comparison.compare(here, comparison.load_report(other))
     path = report_folder(store) / comparison.PAGE
     write_text(path, comparison.render(compared, store.folder, other))
     return compared, path
