@@ -97,7 +97,7 @@ def judge_model(
             f"warning: {network.title}: its weights are off the grid, where the fast engine's "
             "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
         )
-    done = _judge(judgement, cluster)
+    done = judge(judgement, cluster)
     found = Derived.of(store, networks.STEP).load(network.name, OtherEvaluation)
     experiments = summaries(found.trials)
     kinematic = experiments["kinematic"]
@@ -121,24 +121,7 @@ def judge_model(
     }
 
 
-def evaluate_comparison(
-    store: Store,
-    campaigns: list[Collected],
-    cluster: Cluster | None = None,
-    reviewed: bool = False,
-) -> bool:
-    """Judge the network that `analysis.also` asks for; return True if there was anything to do.
-
-    Raises:
-        StoreError: it is missing or stale.
-    """
-    done = False
-    for judgement in networks.comparison_judgements(StoreLabels(store, reviewed), campaigns):
-        done |= _judge(judgement, cluster)
-    return done
-
-
-def _judge(judgement: Judgement, cluster: Cluster | None) -> bool:
+def judge(judgement: Judgement, cluster: Cluster | None) -> bool:
     """Judge a network if anything changed; return True if it did."""
     stale = not judgement.fresh
     if stale:
