@@ -2,7 +2,8 @@
 
 The steps that train, evaluate and report ask `problem_of` and know `Problem` alone. There are
 three: slip by events, slip by marker displacements (of rigs without events), and recordings that
-show classes of their own.
+show classes of their own. A plug-in adds another one, most simply as a `ClassesOfRecordings` with
+classes and labels of its own.
 """
 
 from __future__ import annotations
@@ -10,26 +11,29 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 from sliplab.analysis.campaigns import (
     Collected,
     agreeing,
+    class_names,
     missing_stream,
     of_classes,
     training_campaigns,
 )
 from sliplab.analysis.detectors.predictions import count_spikes, predict_trials, seed_step
-from sliplab.analysis.evaluation import baselines, classes, evaluation, markers, networks
+from sliplab.analysis.evaluation import baselines, evaluation, markers, networks
+from sliplab.analysis.evaluation import classes as class_scores
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.models import (
     ModelOnDisk,
     begun,
+    choose_model,
     comparison_models,
     wanted_class_models,
     wanted_models,
@@ -41,12 +45,14 @@ from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.displacement import MarkerSamples, load_marker_samples
 from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
 from sliplab.storage.files import write_bytes, write_json
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
 from sliplab.storage.trials.store import StoreError
 
-Job = evaluation.EvaluationJob | classes.ClassJob | markers.MarkerJob
+Job = evaluation.EvaluationJob | class_scores.ClassJob | markers.MarkerJob
 """Everything that an evaluation depends on, found before anything is computed."""
 Samples = SampleSet | MarkerSamples
 Watch = Callable[[ModelOnDisk], AbstractContextManager[Any]]
@@ -301,7 +307,15 @@ class SlipByEvents(EventProblem):
 class ClassesOfRecordings(EventProblem):
     """Classes that recordings show, by a spiking network on events."""
 
-    name = classes.NAME
+    name = class_scores.NAME
+
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the classes, by the numbers that samples carry.
+
+        Raises:
+            StoreError: there are fewer than two.
+        """
+        return class_names(self.campaigns)
 
     def used(self) -> list[Collected]:
         """See `EventProblem`; all."""
@@ -309,13 +323,13 @@ class ClassesOfRecordings(EventProblem):
 
     def models(self) -> list[ModelOnDisk]:
         """See `Problem`."""
-        return wanted_class_models(self.labels.store, self.used(), self.labels.reviewed)
+        return wanted_class_models(self.labels, self.campaigns, self.classes())
 
     def samples(self, split: str, each: EachTrial = in_order) -> SampleSet:
         """See `Problem`."""
-        return load_class_samples(self.labels, self.campaigns, split, each)
+        return load_class_samples(self.labels, self.campaigns, split, each, self.classes())
 
-    def job(self, margin: float | None, smoothing: int | None) -> classes.ClassJob:
+    def job(self, margin: float | None, smoothing: int | None) -> class_scores.ClassJob:
         """See `Problem`.
 
         Raises:
@@ -325,19 +339,21 @@ class ClassesOfRecordings(EventProblem):
         for option, value in (("--margin", margin), ("--smoothing", smoothing)):
             if value is not None:
                 raise InputError(option, "", value, f"{shown}; leave it out")
-        return classes.make_class_job(self.labels, self.campaigns)
+        return class_scores.make_class_job(
+            self.labels, self.campaigns, self.classes(), self.models()
+        )
 
-    def prepare(self, job: classes.ClassJob, workers: Workers) -> dict[str, SampleSet]:
+    def prepare(self, job: class_scores.ClassJob, workers: Workers) -> dict[str, SampleSet]:
         """Load the samples of every part of the split."""
-        return {split: self.samples(split, workers.each(split)) for split in classes.SPLITS}
+        return {split: self.samples(split, workers.each(split)) for split in class_scores.SPLITS}
 
-    def evaluate(self, job: classes.ClassJob, parts: Mapping[str, SampleSet]) -> None:
+    def evaluate(self, job: class_scores.ClassJob, parts: Mapping[str, SampleSet]) -> None:
         """See `Problem`."""
-        classes.evaluate_classes(job, parts)
+        class_scores.evaluate_classes(job, parts)
 
     def baselines(self) -> baselines.Methods:
         """See `Problem`."""
-        return baselines.class_methods(self.campaigns)
+        return baselines.class_methods(self.campaigns, len(self.classes()))
 
     def report_key(self) -> str:
         """See `Problem`."""
@@ -347,7 +363,10 @@ class ClassesOfRecordings(EventProblem):
         self, planned_bytes: Callable[[Collected], int], seconds: Mapping[str, float]
     ) -> pages.Page:
         """See `Problem`."""
-        return pages.class_page(self.labels.store, self.campaigns)
+        store = self.labels.store
+        reviewed = class_scores.class_evaluation_of(store).reviewed is not None
+        models = replace(self, labels=replace(self.labels, reviewed=reviewed)).models()
+        return pages.class_page(store, self.campaigns, choose_model(models))
 
 
 class SlipByMarkers(Problem):
@@ -391,11 +410,15 @@ class SlipByMarkers(Problem):
 
 
 def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
-    """Return the problem that campaigns pose.
+    """Return the problem that campaigns pose: one of a plug-in, where it takes them, or ours.
 
     Raises:
         InputError: some show classes and some show slip.
+        PluginError: one of a plug-in cannot be imported.
     """
+    for place in plugins().declared("problems").values():
+        if (found := import_foreign(place)(labels, campaigns)) is not None:
+            return cast("Problem", found)
     if of_classes(campaigns):
         return ClassesOfRecordings(labels, campaigns)
     kind = SlipByMarkers if missing_stream(campaigns) == "events" else SlipByEvents

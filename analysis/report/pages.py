@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, missing_stream
+from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.report import classes, one_camera, report
 from sliplab.analysis.report.marker_network import read_judged
 from sliplab.analysis.report.sources import read_sources, report_key
@@ -31,14 +32,17 @@ class Page:
     simulated: bool
 
 
-def class_page(store: Store, campaigns: list[Collected]) -> Page:
+def class_page(store: Store, campaigns: list[Collected], model: ModelOnDisk) -> Page:
     """Return the page about recordings of classes.
+
+    Args:
+        model: the evaluated network.
 
     Raises:
         StoreError: there is no evaluation of this version yet.
     """
     summary = classes.class_summary(store, campaigns)
-    sections = classes.class_sections(store, campaigns, summary)
+    sections = classes.class_sections(store, campaigns, summary, model)
     html = classes.render(campaigns, summary, sections)
     return Page(summary.to_json(), sections, html, summary.simulated)
 
