@@ -57,7 +57,8 @@ def train_flow(
         )
         _warn_of_missing(models[0].classes, train)
         for model in models:
-            train_one(Opaque((problem, model, train, validation, simulated)))
+            train_model = train_one.with_options(task_run_name=f"train {model.title}")
+            train_model(Opaque((problem, model, train, validation, simulated)))
     return len(models)
 
 

@@ -325,9 +325,7 @@ class LiveDetector:
         edges = np.flatnonzero(np.diff(chunk.t_us) > self._gap_us) + 1
         made = []
         for part in np.split(np.arange(len(chunk)), edges) if len(edges) else [slice(None)]:
-            made += self._push(
-                EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-            )
+            made += self._push(chunk[part])
         return made
 
     def advance(self, to_us: int) -> list[LiveDecision]:
@@ -358,8 +356,7 @@ class LiveDetector:
         before = np.maximum.accumulate(np.concatenate([t_us[:1], t_us[:-1]]))
         disordered = int(np.count_nonzero(t_us < before))
         if disordered:
-            order = np.argsort(t_us, kind="stable")
-            chunk = EventChunk(chunk.x[order], chunk.y[order], chunk.p[order], t_us[order])
+            chunk = chunk[np.argsort(t_us, kind="stable")]
         self.losses.disordered += disordered
         if self._judged_us is not None:
             self.losses.late += int(np.searchsorted(chunk.t_us, self._judged_us))
@@ -386,9 +383,7 @@ class LiveDetector:
         window = self._opened(number, start_us)
         if begin == end:
             return
-        part = slice(begin, end)
-        inside = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-        more = self._bin(inside, start_us)
+        more = self._bin(chunk[begin:end], start_us)
         # 255 stays 255, as if all had been counted at once
         window.x += np.minimum(more, 255 - window.x)
         window.events += end - begin
@@ -464,9 +459,7 @@ class LiveDetector:
         return low
 
 
-_NO_EVENTS = EventChunk(
-    np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8), np.empty(0, np.int64)
-)
+_NO_EVENTS = EventChunk.empty()
 
 
 SPAN_NS = 5_000_000_000

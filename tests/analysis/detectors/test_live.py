@@ -74,7 +74,7 @@ def events(t_us: list[int] | npt.NDArray[np.int64], seed: int = 0) -> EventChunk
 
 
 def part(chunk: EventChunk, which: object) -> EventChunk:
-    return EventChunk(chunk.x[which], chunk.y[which], chunk.p[which], chunk.t_us[which])  # type: ignore[index]
+    return chunk[which]
 
 
 def offline(chunk: EventChunk, starts_us: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
