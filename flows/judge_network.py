@@ -129,7 +129,7 @@ def judge_predictions(
 
 def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
     """Judge a network, and return its stored figures."""
-    done = _judge(judgement, cluster)
+    done = judge(judgement, cluster)
     store, campaigns, network = judgement.store, judgement.campaigns, judgement.network
     found = Derived.of(store, networks.STEP).load(network.name, OtherEvaluation)
     experiments = summaries(found.trials)
@@ -154,24 +154,7 @@ def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
     }
 
 
-def evaluate_comparison(
-    store: Store,
-    campaigns: list[Collected],
-    cluster: Cluster | None = None,
-    reviewed: bool = False,
-) -> bool:
-    """Judge the network that `analysis.also` asks for; return True if there was anything to do.
-
-    Raises:
-        StoreError: it is missing or stale.
-    """
-    done = False
-    for judgement in networks.comparison_judgements(StoreLabels(store, reviewed), campaigns):
-        done |= _judge(judgement, cluster)
-    return done
-
-
-def _judge(judgement: Judgement, cluster: Cluster | None) -> bool:
+def judge(judgement: Judgement, cluster: Cluster | None) -> bool:
     """Judge a network if anything changed; return True if it did."""
     stale = not judgement.fresh
     if stale:
