@@ -274,10 +274,9 @@ class FrameFaults:
         for fault, begin_ns, _ in self._world.faults.spans(FramesLost):
             first = self._trigger.tick_at(begin_ns)
             lost |= (ticks >= first) & (ticks < first + fault.count)
-        for gone, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
-            if gone.device == "frame_camera":
-                true_ns = self._trigger.true_ns(ticks)
-                lost |= (true_ns >= begin_ns) & (true_ns < end_ns)
+        for _, begin_ns, end_ns in self._world.faults.spans(DeviceGone, target="frame_camera"):
+            true_ns = self._trigger.true_ns(ticks)
+            lost |= (true_ns >= begin_ns) & (true_ns < end_ns)
         return lost
 
     def arrival_ns(self, ticks: I64, on_time_ns: I64) -> I64:

@@ -471,19 +471,9 @@ class MockSettings(SimulatedRig):
         return made if made is None else GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
 
     @property
-    def grip_opening_mm(self) -> float | None:
-        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        return None if self.gripper is None else self.gripper.opening_mm
-
-    @property
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
         return self.frame_camera.level
-
-    @property
-    def block_ms(self) -> int:
-        """Duration of the blocks that the event camera sends."""
-        return self.event_camera.block_ms
 
     def rig_faults(self, rig: RigFile) -> Iterator[KeyedError]:
         """Return where the simulated devices are not those that the rig file states."""
@@ -505,6 +495,10 @@ class MockSettings(SimulatedRig):
         if stated.rate_hz is not None and camera.rate_hz != stated.rate_hz:
             text = f"must be mock.frame_camera.rate_hz = {camera.rate_hz:g}"
             yield KeyedError("frame_camera.rate_hz", stated.rate_hz, text)
+        block_ms, reflex = self.event_camera.block_ms, rig.reflex
+        if reflex is not None and reflex.stream_timeout * 1000 <= block_ms:
+            text = f"must be over {block_ms} ms, the camera's blocks"
+            yield KeyedError("reflex.stream_timeout", f"{reflex.stream_timeout} s", text)
         sensor = None if rig.devices is None else rig.devices.force_sensor_driver
         yield from _timing_faults(self, rig.timing, sensor is not None and sensor.of_arm)
 
