@@ -27,7 +27,6 @@ from sliplab.rigs.scene.frames import (
     Exposures,
     FrameOptics,
     PlateView,
-    Reflections,
     expose,
 )
 from sliplab.rigs.scene.lens import BoardCamera, BoardPlace, BoardPrint, draw_board
@@ -250,7 +249,7 @@ def _optics(settings: MockSettings, camera: MockFrameCameraSettings) -> FrameOpt
         tilt_deg=camera.tilt_deg,
         k1=camera.k1,
         distance_mm=camera.distance_mm,
-        reflections=Reflections(**camera.reflections.model_dump()),
+        reflections=camera.reflections,
     )
 
 
