@@ -20,19 +20,13 @@ from sliplab.rigs.core.capabilities import (
     RigError,
     Simulation,
 )
+from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.driver import (
     EventCameraDriver,
     ForceSensorDriver,
     FrameCameraDriver,
     RigDriver,
     ScalarSensorDriver,
-)
-from sliplab.rigs.core.further import (
-    FurtherEvents,
-    FurtherForces,
-    FurtherFrames,
-    FurtherScalars,
-    FurtherStream,
 )
 from sliplab.rigs.core.guard import Guard, PlateLimits
 from sliplab.rigs.core.host_clock import HostClock
@@ -182,7 +176,7 @@ def _frame_camera(file: RigFile, devices: DeviceSettings) -> FrameCamera:
     return devices.frame_camera_driver.build(devices.frame_camera, scale)
 
 
-def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> FurtherStream:
+def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> DeviceStream:
     """Build a further device by its driver; the arm's controller may measure its forces.
 
     Raises:
@@ -208,7 +202,7 @@ def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> Fur
     return made
 
 
-def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) -> FurtherStream:
+def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) -> DeviceStream:
     """Return a further device of a rig with what a trial's record says of its stream.
 
     Args:
@@ -221,14 +215,14 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
     stated: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
     if isinstance(stream, EventStream):
         stated["size_px"] = (device.width, device.height)
-        return FurtherEvents(name, device, StreamRecord(**stated))
+        return DeviceStream(name, device, StreamRecord(**stated))
     if isinstance(stream, FrameStream):
         device.set_region(*stream.region_px)
         stated["size_px"], stated["px_per_mm"] = stream.region_px, stream.scale_px_per_mm
         stated["mid_exposure_ns"] = device.mid_exposure_ns
         if stream.rate_hz is not None:
             stated["rate_hz"] = stream.rate_hz
-        return FurtherFrames(name, device, StreamRecord(**stated))
+        return DeviceStream(name, device, StreamRecord(**stated))
     if isinstance(stream, ForceStream):
         if device.grade != stream.timing.grade:
             text = (
@@ -237,11 +231,11 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
             )
             raise RigError(f"{name} (force sensor)", text)
         matrix = plate.force_matrix(device.mounting)
-        return FurtherForces(name, device, StreamRecord(**stated, to_plate=matrix))
+        return DeviceStream(name, device, StreamRecord(**stated, to_plate=matrix))
     if device.unit != stream.unit:
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)
-    return FurtherScalars(name, device, StreamRecord(**stated, unit=stream.unit))
+    return DeviceStream(name, device, StreamRecord(**stated, unit=stream.unit))
 
 
 def plate_limits(file: RigFile) -> PlateLimits:

@@ -409,7 +409,7 @@ def _left_out(events: dict[str, int]) -> ForeignChunk:
 
 
 def _part(chunk: EventChunk, count: int) -> EventChunk:
-    return EventChunk(chunk.x[:count], chunk.y[:count], chunk.p[:count], chunk.t_us[:count])
+    return chunk[:count]
 
 
 RAW = Format(

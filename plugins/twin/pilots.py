@@ -224,7 +224,7 @@ def simulate_pilot(
             )
             camera = forces = None
             if with_events and sink.events:
-                events = EventChunk.joined(sink.events)
+                events = EventChunk.concatenate(sink.events)
                 t_us = events.t_us - start_ns // 1000
                 camera = SlideEvents(
                     EventChunk(events.x, events.y, events.p, t_us),

@@ -47,7 +47,7 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
 from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, MotionStep
-from sliplab.storage.streams import Json, StreamChunk
+from sliplab.storage.streams import Chunk, Json
 from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, Store
 
 GIVEN, UNKNOWN = "given", "unknown"
@@ -326,9 +326,9 @@ class _Opening:
             self.found.folder, self._names(FRAMES), self._names(FRAME_TIMES), part, paths
         )
 
-    def _streams(self) -> dict[str, StreamChunk]:
+    def _streams(self) -> dict[str, Chunk]:
         folder, parts = self.found.folder, self.found.adapter.streams
-        chunks: dict[str, StreamChunk] = {}
+        chunks: dict[str, Chunk] = {}
         for kind, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
             for name in named:
                 if not (files := self._names(key := f"{kind}.{name}")):

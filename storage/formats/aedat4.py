@@ -381,8 +381,7 @@ def _empty(count: int) -> EventChunk:
 
 
 def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    part = slice(low, high)
-    return EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+    return chunk[low:high]
 
 
 def _length(data: bytes, most: int) -> int:

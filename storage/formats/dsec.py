@@ -28,7 +28,6 @@ from sliplab.storage.formats.foreign import (
     read_head,
     resolution_us,
     rounded_us,
-    some_rows,
 )
 from sliplab.storage.formats.time_order import is_unordered
 from sliplab.storage.schema.trial import Lost
@@ -212,7 +211,7 @@ def _sorted(x: I64, y: I64, p: Any, t_us: I64, resolution: float) -> EventChunk:
     chunk = event_chunk(x, y, p, t_us, resolution)
     if not is_unordered(chunk.t_us, chunk.p > 0):
         return chunk
-    return some_rows(chunk, np.argsort(chunk.t_us, kind="stable"))
+    return chunk[np.argsort(chunk.t_us, kind="stable")]
 
 
 def _lab_trial(

@@ -320,7 +320,7 @@ def _packets(recording: Recording, name: str) -> Iterator[EventChunk]:
             edges = np.flatnonzero(np.diff(parts)) + 1
             whole = np.union1d(edges, np.arange(0, len(chunk), _PACKET_EVENTS)).tolist()
             for low, high in zip(whole, [*whole[1:], len(chunk)], strict=True):
-                yield EventChunk(*(column[low:high] for column in vars(chunk).values()))
+                yield chunk[low:high]
 
 
 def _column_units(reader: StreamReader) -> dict[str, str]:
@@ -328,14 +328,14 @@ def _column_units(reader: StreamReader) -> dict[str, str]:
     known = {**COLUMNS, **TRACKS, **TIMING}
     counts = reader.counts()
     found = {
-        name: unit
-        for name, (_, _, unit) in known.items()
+        name: column.unit
+        for name, column in known.items()
         if counts[name] and not name.startswith("events/")
     }
     for name, kind in reader.streams().items():
         unit = reader.scalars(name).unit if kind == "scalar" else ""
-        for part, (_, (_, _, of_part)) in STREAMS.get(kind, {}).items():
-            found[f"{STREAM_GROUP}/{name}/{part}"] = unit if part == "value" else of_part
+        for part, column in STREAMS[kind].columns.items() if kind in STREAMS else ():
+            found[f"{STREAM_GROUP}/{name}/{part}"] = unit if part == "value" else column.unit
     return found
 
 

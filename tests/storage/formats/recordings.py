@@ -34,7 +34,7 @@ def all_events(count: int = COUNT) -> EventChunk:
 
 def part_of(chunk: EventChunk, low: int, high: int) -> EventChunk:
     """Events low to high, the last one not included."""
-    return EventChunk(chunk.x[low:high], chunk.y[low:high], chunk.p[low:high], chunk.t_us[low:high])
+    return chunk[low:high]
 
 
 def write_aedat4(path: Path) -> None:
