@@ -18,6 +18,9 @@ from sliplab.rigs.stream_settings import keyed_drivers
 if TYPE_CHECKING:
     from sliplab.rigs.rig_file import RigFile
 
+STREAMS = "streams."
+"""Before the name of a further camera's stream, among the names of fakes."""
+
 
 def _faults(rig: RigFile) -> Iterator[KeyedError]:
     """Check that the fakes simulate what the rig file says of the real devices."""
