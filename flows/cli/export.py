@@ -35,12 +35,13 @@ def export(
         str | None,
         typer.Option(
             "--as",
-            help="Form. Of PART: aedat4, dsec or labels (.csv, .parquet, .json). Of a store: "
-            "croissant, mcap or lerobot. Of a model: onnx or card. Plug-ins add further ones.",
+            help="Form. Of PART: aedat4, dsec, or labels or samples (.csv, .parquet, .json). Of a "
+            "store: croissant, mcap or lerobot. Of a model: onnx or card. Plug-ins add others.",
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to write, or file for labels.")
+        Path,
+        typer.Option("--output", "-o", help="Folder to write, or file for labels and samples."),
     ] = ...,  # type: ignore[assignment]  # typer's word for: must be given
     campaign: Annotated[
         list[str] | None,
@@ -58,7 +59,10 @@ def export(
     ] = None,
     stream: Annotated[
         str | None,
-        typer.Option("--stream", help="Trials: a further event camera's stream, by its name."),
+        typer.Option(
+            "--stream",
+            help="Trials: an event camera's stream by its name; samples: any other one (force).",
+        ),
     ] = None,
     store: Annotated[
         Path | None,

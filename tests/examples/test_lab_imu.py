@@ -1,0 +1,91 @@
+"""A kind of stream of another package is recorded, timed, verified, shown and exported."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sliplab.flows.api import open_store
+from sliplab.flows.exports import ExportRequest, check_export
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.ui import view
+from sliplab.storage.errors import StoreError
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.examples.conftest import EXAMPLES
+from tests.flows.collecting.test_further_streams import session
+
+GRAVITY = [0.0, 0.0, 9.81]
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """One slide on a rig with an inertial sensor."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLES / "lab-imu"))
+        lab: Any = importlib.import_module("lab_imu")
+        work, campaign = session(tmp_path_factory.mktemp("imu") / "a", {})
+        work.rig.further += (lab.imu_stream(lab.Imu(work.rig.clock)),)
+        work.take(pending_trials(work.plan, campaign)[:1])
+    (recording,) = campaign.recordings()
+    return recording
+
+
+def store_of(recording: Recording) -> Path:
+    return recording.folder.parents[3]
+
+
+def test_recorded_and_verified(taken: Recording) -> None:
+    about, found = taken.record.streams["imu"], taken.samples("imu")
+    assert (about.kind, about.rows) == ("imu", len(found["t"]))
+    assert about.rows > 50
+    assert set(found) == {"t", "acceleration", "temperature"}
+    assert (found["acceleration"] == GRAVITY).all()
+    assert found["temperature"].dtype == np.float32
+    assert verify(Store.open(store_of(taken))) == []
+    with pytest.raises(StoreError, match="no samples 'force'; it has: imu"):
+        taken.samples("force")
+
+
+def test_timed(taken: Recording) -> None:
+    assert taken.record.clocks.streams["imu"].grade == "host arrival"
+    assert taken.record.quality.gates["sync_uncertainty_imu_s"].passed
+    with taken.open() as reader:
+        sent_ns = reader.stream("imu")["t"]
+    assert np.array_equal(taken.samples("imu")["t"], taken.clock("imu").to_reference(sent_ns))
+
+
+def test_listed(taken: Recording) -> None:
+    store = Store.open(store_of(taken))
+    trial = open_store(store_of(taken)).trial(taken.folder.name)
+    assert trial.streams()["imu"] == "imu"
+    assert catalogue(store)["imu_imu"].tolist() == [taken.record.streams["imu"].rows]
+
+
+def test_shown(taken: Recording, tmp_path: Path) -> None:
+    chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (sliplab[view])")
+    store = Store.open(store_of(taken))
+    counts = view.save(view.find(store, taken.folder.name), tmp_path / "a.rrd")
+    assert counts["imu_imu"] == taken.record.streams["imu"].rows
+    shown = {str(chunk.entity_path) for chunk in chunks.RrdReader(tmp_path / "a.rrd").stream()}
+    parts = {*(f"acceleration/{axis}" for axis in range(3)), "temperature/0"}
+    assert {f"/streams/imu/{part}" for part in parts} <= shown
+
+
+def test_exported_as_a_table(taken: Recording, tmp_path: Path) -> None:
+    output = tmp_path / "imu.parquet"
+    trial = taken.folder.name
+    request = ExportRequest(str(store_of(taken)), trial, "samples", output, {"stream": "imu"})
+    check_export(request).write(request)
+    table = pd.read_parquet(output)
+    values = [f"acceleration_{axis}" for axis in range(3)]
+    assert list(table) == ["trial", "t_ns", *values, "temperature"]
+    assert (table[values] == GRAVITY).all(axis=None)
+    assert table["t_ns"].tolist() == taken.samples("imu")["t"].tolist()
