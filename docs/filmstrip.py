@@ -20,9 +20,9 @@ import numpy as np
 
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.build import simulated_rig
-from sliplab.rigs.levels import with_level
 from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.levels import with_level
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink
 

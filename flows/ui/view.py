@@ -40,7 +40,6 @@ from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import RATE_NS, event_rate
-from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import start_tethered
@@ -58,25 +57,10 @@ def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
     """Find the committed trial of this id.
 
     Raises:
-        InputError: it does not exist, or several campaigns have it.
+        NoTrial: it does not exist, or several campaigns have it.
     """
-    found = [
-        Collected(item)
-        for item in store.campaigns()
-        if campaign in (None, item.name) and trial in item.committed()
-    ]
-    if not found:
-        where = str(store.folder) if campaign is None else f"campaign '{campaign}'"
-        raise InputError(
-            "TRIAL",
-            "",
-            trial,
-            f"is no committed trial of {where}; `sliplab trials {store.folder}` lists them",
-        )
-    if len(found) > 1:
-        names = ", ".join(item.name for item in found)
-        raise InputError("TRIAL", "", trial, f"is in {names}; name one with --campaign")
-    return Subject(store, found[0], found[0].campaign.recording(trial))
+    item = store.holder(trial, campaign)
+    return Subject(store, Collected(item), item.recording(trial))
 
 
 def rerun() -> ModuleType:

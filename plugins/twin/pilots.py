@@ -24,7 +24,7 @@ from sliplab.plugins.twin.pilot import (
 from sliplab.plugins.twin.statistics import SlideStatistics, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.levels import choose_level
+from sliplab.rigs.mock.levels import choose_level
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import (
     EventChunk,

@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import faults_of
 from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
@@ -48,7 +49,6 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
-from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
     DeviceRecord,
     Gate,
@@ -748,5 +748,5 @@ def _record(
     try:
         return TrialRecord.model_validate(values)
     except ValidationError as error:
-        key, value, expected = first_fault(error)
-        raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None
+        fault = faults_of(TrialRecord, error)[0]
+        raise FormatError(f"holds {fault.key} = {fault.value!r:.60}, which {fault}") from None

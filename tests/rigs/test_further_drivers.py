@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sliplab.protocols import InputError
-from sliplab.rigs.build import _driven_stream
+from sliplab.rigs.build import driven_stream
 from sliplab.rigs.core.capabilities import RigError, ScalarSensor
 from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.plate_frame import PlateFrame
@@ -92,7 +92,7 @@ def built(name: str, stream: Stream) -> DeviceStream:
     """A further device by its driver, on a plate as an arm's base."""
     frame = PlateFrame.taught(((0.0, 0.0, 0.0), (60.0, 0.0, 0.0), (0.0, 60.0, 0.0)))
     arm: Any = Arm()
-    return _driven_stream(name, stream, None, arm, frame)
+    return driven_stream(name, stream, arm, frame)
 
 
 def real_rig(folder: Path, streams: dict[str, Any], **devices: Any) -> RigFile:

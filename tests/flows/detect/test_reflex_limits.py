@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program
-from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.path import SENSOR
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.truth import COURSE, plate_course, watch_plate
 from sliplab.rigs.rig_file import load_rig_file
