@@ -1,19 +1,20 @@
 """A kind of stream that SlipLab does not know, in one file: an inertial sensor on the arm.
 
-Give a rig the sensor before it takes trials: `rig.further += (imu_stream(Imu(rig.clock)),)`. The
-stream is then recorded, timed, verified, shown and exported like any other.
+With the entry point `lab_imu = "lab_imu:DRIVER"` of `sliplab.drivers`, a rig file names it under
+`streams` as `wrist: {kind: imu, device: {driver: lab_imu}}`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from sliplab.protocols.timing import StreamTiming
 from sliplab.rigs.core.capabilities import Clock
-from sliplab.rigs.core.device_stream import DeviceStream
-from sliplab.storage.schema.trial import StreamRecord
+from sliplab.rigs.core.device_settings import DriverSettings
+from sliplab.rigs.core.driver import SensorDriver
+from sliplab.rigs.core.host_clock import HostClock
 from sliplab.storage.streams import F64, I64, SCALAR, Chunk, Column, StreamKind
 
 PERIOD_NS = 10_000_000
@@ -49,6 +50,8 @@ class Imu:
     def connect(self) -> None:
         """Open the connection."""
 
+    stop = close = connect
+
     def start(self) -> None:
         """Start streaming."""
         self._next_ns = self._clock.now_ns()
@@ -60,14 +63,16 @@ class Imu:
         still = np.tile([0.0, 0.0, 9.81], (len(t_ns), 1))
         return ImuChunk(t_ns, t_ns, still, np.full(len(t_ns), 21.5, np.float32))
 
-    def stop(self) -> None:
-        """Stop streaming."""
 
-    def close(self) -> None:
-        """Close the connection."""
+class ImuSettings(DriverSettings):
+    driver: Literal["lab_imu"] = "lab_imu"
 
 
-def imu_stream(sensor: Imu, name: str = "imu") -> DeviceStream:
-    """Return the sensor as a rig's device, timed by the arrival of its samples."""
-    timing = StreamTiming(grade="host arrival", delay={"shortest_us": 0, "longest_us": 2000})
-    return DeviceStream(name, sensor, StreamRecord(kind=IMU.name, rows=0, timing=timing))
+DRIVER = SensorDriver(
+    name="lab_imu",
+    title="an inertial sensor",
+    settings=ImuSettings,
+    ping=lambda settings: None,
+    build=lambda settings: Imu(HostClock()),
+    stream=IMU,
+)

@@ -14,13 +14,22 @@ from sliplab.flows.api import open_store
 from sliplab.flows.exports import ExportRequest, check_export
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.ui import view
+from sliplab.protocols import InputError
+from sliplab.protocols.timing import Delay, StreamTiming
+from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.storage.errors import StoreError
+from sliplab.storage.schema.trial import StreamRecord
+from sliplab.storage.streams import NullSink
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.examples.conftest import EXAMPLES
 from tests.flows.collecting.test_further_streams import session
+from tests.rigs.core.test_registry import Install, install
+from tests.rigs.test_further_drivers import built, real_rig
+
+__all__ = ["install"]
 
 GRAVITY = [0.0, 0.0, 9.81]
 
@@ -31,15 +40,38 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLES / "lab-imu"))
         lab: Any = importlib.import_module("lab_imu")
-        work, campaign = session(tmp_path_factory.mktemp("imu") / "a", {})
-        work.rig.further += (lab.imu_stream(lab.Imu(work.rig.clock)),)
-        work.take(pending_trials(work.plan, campaign)[:1])
+    work, campaign = session(tmp_path_factory.mktemp("imu") / "a", {})
+    delay = Delay(shortest_us=0, longest_us=2000)
+    about = StreamRecord(kind=lab.IMU.name, rows=0, timing=StreamTiming(delay=delay))
+    work.rig.further += (DeviceStream("imu", lab.Imu(work.rig.clock), about),)
+    work.take(pending_trials(work.plan, campaign)[:1])
     (recording,) = campaign.recordings()
     return recording
 
 
 def store_of(recording: Recording) -> Path:
     return recording.folder.parents[3]
+
+
+def test_named_in_a_rig_file(install: Install, tmp_path: Path) -> None:
+    source = (EXAMPLES / "lab-imu" / "lab_imu.py").read_text()
+    install("lab_imu", source, "lab_imu = lab_imu:DRIVER")
+    imu = {"kind": "imu", "device": {"driver": "lab_imu"}}
+    stream = real_rig(tmp_path, {"wrist": imu}).streams["wrist"]
+    device, got = built("wrist", stream), []
+
+    class Sink(NullSink):
+        def add(self, device: str, chunk: Any) -> None:
+            got.append((device, chunk.KIND.name))
+
+    device.connect()
+    device.start()
+    device.finish(Sink())
+    assert (device.about.kind, device.through_host, got) == ("imu", True, [("wrist", "imu")])
+    with pytest.raises(InputError, match="must be imu, which the driver lab_imu sends"):
+        real_rig(tmp_path, {"wrist": {**imu, "kind": "scalar", "unit": "V"}})
+    with pytest.raises(InputError, match="must be one of events, frames, wrench, scalar"):
+        real_rig(tmp_path, {"wrist": {**imu, "kind": "imo"}})
 
 
 def test_recorded_and_verified(taken: Recording) -> None:
