@@ -578,7 +578,7 @@ def export(
     Args:
         place: a store's folder or URL, or a model's file.
         form: its name, such as ``aedat4``, ``dsec``, ``labels`` or ``croissant``.
-        output: folder to write, or file for labels.
+        output: folder to write, or file for labels or samples.
         part: a campaign or a trial of the store, where the form is of one.
         options: of the form: ``campaign``, ``title``, ``creator``, ``licence``, ``stream``,
             ``store``, ``windows``.

@@ -329,18 +329,17 @@ class _Opening:
     def _streams(self) -> dict[str, Chunk]:
         folder, parts = self.found.folder, self.found.adapter.streams
         chunks: dict[str, Chunk] = {}
-        for kind, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
-            for name in named:
+        tables: Any = (
+            ("wrenches", read_wrench, parts.wrenches),
+            ("scalars", read_scalar, parts.scalars),
+        )
+        for kind, read, named in tables:
+            for name, part in named.items():
                 if not (files := self._names(key := f"{kind}.{name}")):
                     continue
-                rows = f"rows of {name}"
-                if kind == "wrenches":
-                    wrench = partial(read_wrench, folder, files[0], parts.wrenches[name])
-                    chunks[name] = self._samples(name, rows, self._read(key, wrench))
-                else:
-                    scalar = partial(read_scalar, folder, files[0], parts.scalars[name])
-                    chunks[name] = self._samples(name, rows, self._read(key, scalar))
-                self._clock(named[name].clock, name)
+                found = self._read(key, partial(read, folder, files[0], part))
+                chunks[name] = self._samples(name, f"rows of {name}", found)
+                self._clock(part.clock, name)
         return chunks
 
     def _clock(self, clock: StreamClock | None, device: str) -> None:

@@ -754,6 +754,16 @@ class StreamReader:
         """
         return self._file.parts(name)
 
+    def stream(self, name: str) -> dict[str, Array]:
+        """Return all rows of a named stream of any kind, by column.
+
+        Raises:
+            NotOurs: there is no such stream, or it is none that SlipLab wrote.
+        """
+        parts = self.parts(name)
+        rows = self._group(f"{STREAM_GROUP}/{name}", *parts)
+        return {part: column.read() for part, column in zip(parts, rows, strict=True)}
+
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""
         values = self._rows(name).read()

@@ -19,6 +19,7 @@ import numpy as np
 
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.files import inside, json_text
+from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.schema.label import KINDS, LABELS, RULES, RuleOnsets, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, Json
 from sliplab.storage.trials.checksums import DATA, PROVENANCE, RECORD, stream_file
@@ -73,6 +74,11 @@ def write_mcap(
     """
     from mcap.writer import Writer
 
+    for name, stream in recording.record.streams.items():
+        if not stream.of_camera and stream.kind not in STREAMS:
+            raise FormatError(
+                f"has the stream '{name}' of kind '{stream.kind}', which MCAP does not take"
+            )
     with path.open("xb") as handle:
         writer = Writer(handle)
         writer.start(profile="ros2", library=LIBRARY)
