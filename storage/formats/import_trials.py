@@ -26,6 +26,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
+from sliplab.storage.formats.by_time import by_time
 from sliplab.storage.formats.foreign import (
     LATEST_US,
     NO_TIME,
@@ -41,12 +42,12 @@ from sliplab.storage.formats.foreign import (
     NoEvents,
     Whole,
     as_damage,
-    before_damage,
     inside,
     left_out_of,
     refusal,
     some_rows,
 )
+from sliplab.storage.formats.recognition import before_damage
 from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
@@ -390,6 +391,7 @@ def _take_whole(
     trial = replace(
         trial,
         events=whole.events,
+        any_order=whole.any_order,
         event_px=whole.event_px,
         triggers=whole.triggers,
         frames=whole.frames,
@@ -414,7 +416,10 @@ def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _
     try:
         return _write(campaign, trial, kind, _Content())
     except _RunsBack:
-        return _write(campaign, trial, kind, _Content(_orders(trial)))
+        if not trial.any_order:
+            return _write(campaign, trial, kind, _Content(_orders(trial)))
+    sorted_ = replace(trial, events=partial(by_time, trial.events), any_order=False)
+    return _take(store, campaign, sorted_, kind)
 
 
 def _orders(trial: ForeignTrial) -> dict[str, Mask]:

@@ -14,7 +14,7 @@ import numpy as np
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.flatbuffers import events_buffer
-from sliplab.storage.formats.foreign import Triggers
+from sliplab.storage.formats.foreign import Triggers, part_of
 from sliplab.storage.streams import EventChunk
 
 COUNT, PACKET = 3000, 100
@@ -30,11 +30,6 @@ def all_events(count: int = COUNT) -> EventChunk:
         rng.integers(0, 2, count).astype(np.uint8),
         np.cumsum(rng.integers(0, 60, count)).astype(np.int64),
     )
-
-
-def part_of(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    """Events low to high, the last one not included."""
-    return EventChunk(chunk.x[low:high], chunk.y[low:high], chunk.p[low:high], chunk.t_us[low:high])
 
 
 def write_aedat4(path: Path) -> None:
