@@ -18,7 +18,7 @@ import numpy as np
 from sliplab.analysis.clocks.synchronise import (
     SyncStreams,
     TrialSync,
-    further_clocks,
+    clocks_in,
     streams_of,
     synchronise,
 )
@@ -36,6 +36,9 @@ from sliplab.storage.streams import (
     F64,
     FRAMES_KIND,
     I64,
+    SCALAR,
+    WRENCH,
+    Chunk,
     PathSegment,
     ScalarChunk,
     WrenchChunk,
@@ -137,28 +140,22 @@ def assess(
         frame_rate_hz: of a frame camera that runs by itself; None for `rate_hz`, the box's ticks.
     """
     further = further or {}
-    clocks = further_clocks(folder, further)
+    clocks = clocks_in(folder, further)
     with StreamReader(folder / DATA) as reader:
         streams = streams_of(reader, mid_exposure_ns, clocks)
         event_us = reader.event_times()
         pose_mm = reader.column("poses/xyz")
         tracks = [reader.column(name) for name in TRACKS if reader.has(name)]
-        named = {
-            name: StreamRecord(kind=kind, rows=reader.stream_counts()[name]["t"])
+        counted = reader.stream_counts()
+        about = {
+            name: StreamRecord(kind=kind, rows=0)
             for name, kind in reader.streams().items()
             if name not in further
         }
-        readings = {
-            name: reader.scalars(name)
-            for name, about in further.items()
-            if about.kind == ScalarChunk.KIND
-        }
-        loads = {
-            name: reader.wrenches(name)
-            for name, about in further.items()
-            if about.kind == WrenchChunk.KIND
-        }
-        wrenches = reader.wrenches(FORCE) if FORCE in named and to_plate is not None else None
+        if to_plate is not None and FORCE in about:
+            about[FORCE] = StreamRecord(kind=WRENCH.name, rows=0, to_plate=to_plate)
+        about |= further
+        samples = {name: _read_samples(name, stream.kind, reader) for name, stream in about.items()}
     sync = synchronise(streams, timing, rate_hz, with_events=with_events)
     there = {"events": with_events, "arm": True, "frames": mid_exposure_ns is not None}
     devices = [*(name for name, recorded in there.items() if recorded), *sorted(sync.streams)]
@@ -177,29 +174,21 @@ def assess(
     results["path_deviation_mm"] = _gate(away, float(gates.path_deviation))
     off = speed_deviation_percent(streams.pose_ns, streams.pose_host_ns, pose_mm, motion.path)
     results["speed_deviation_percent"] = _gate(off, float(gates.speed_deviation))
-    if wrenches is not None and to_plate is not None:
-        figures = _force_figures(wrenches, to_plate, sync, motion)
-        results |= _force_gates(figures, gates)
-        named[FORCE] = StreamRecord(
-            kind=wrenches.KIND, rows=len(wrenches), to_plate=to_plate, figures=figures
-        )
-    elif gates.normal_force is not None or gates.hold_force is not None:
-        results |= _force_gates({}, gates)
-    for name, about in further.items():
-        if about.of_camera:
+    named: dict[str, StreamRecord] = {}
+    camera_gates: dict[str, Gate] = {}
+    for name, stream in about.items():
+        if stream.of_camera:
             with StreamReader(folder / stream_file(name)) as reader:
                 named[name], gated = _further_camera(
-                    name, about, reader, streams, sync, motion, gates, rate_hz
+                    name, stream, reader, streams, sync, motion, gates, rate_hz
                 )
-            results |= gated
-        elif about.kind == WrenchChunk.KIND:
-            rows: dict[str, Any] = {"rows": len(loads[name])}
-            if about.to_plate is not None:
-                figures = _force_figures(loads[name], about.to_plate, sync, motion, name)
-                rows["figures"] = figures
-            named[name] = about.model_copy(update=rows)
+            camera_gates |= gated
         else:
-            named[name] = _scalar_record(about, readings[name])
+            found: dict[str, Any] = {"rows": counted[name]["t"] if name in counted else 0}
+            figures = _figures(name, stream, samples[name], sync, motion)
+            named[name] = stream.model_copy(update=found | figures)
+    results |= _force_gates(named[FORCE].figures if FORCE in named else {}, gates)
+    results |= camera_gates
     counts = StreamCounts(
         events=len(event_us),
         frames=len(streams.frame_ns),
@@ -235,24 +224,28 @@ def _further_camera(
     return about.model_copy(update={"rows": len(numbers)}), {f"frames_lost_{name}": gate}
 
 
-def _scalar_record(about: StreamRecord, readings: ScalarChunk) -> StreamRecord:
-    """Count the readings of a scalar sensor, with their figures, to seven digits."""
-    figures: dict[str, float] = {}
-    if len(readings):
-        values = readings.value
-        figures = {
-            name: float(f"{value:.7g}")
-            for name, value in (
-                ("mean", values.mean()),
-                ("min", values.min()),
-                ("max", values.max()),
-            )
-        }
-    return about.model_copy(update={"rows": len(readings), "figures": figures})
+def _read_samples(name: str, kind: str, reader: StreamReader) -> Chunk | None:
+    """Return the samples of a named stream, where they have figures."""
+    if kind == WRENCH.name:
+        return reader.wrenches(name)
+    return reader.scalars(name) if kind == SCALAR.name else None
+
+
+def _figures(
+    name: str, about: StreamRecord, found: Chunk | None, sync: TrialSync, motion: Motion
+) -> dict[str, dict[str, float]]:
+    """Return the figures of a stream's samples as its record has them; empty without any."""
+    if isinstance(found, WrenchChunk) and about.to_plate is not None:
+        return {"figures": _force_figures(found, about.to_plate, sync, motion, name)}
+    if not isinstance(found, ScalarChunk):
+        return {}
+    values = found.value
+    known = (("mean", np.mean), ("min", np.min), ("max", np.max)) if len(values) else ()
+    return {"figures": {key: float(f"{of(values):.7g}") for key, of in known}}
 
 
 def _force_figures(
-    wrenches: WrenchChunk, to_plate: Rows, sync: TrialSync, motion: Motion, name: str = FORCE
+    wrenches: WrenchChunk, to_plate: Rows, sync: TrialSync, motion: Motion, name: str
 ) -> dict[str, float]:
     """Return the figures of a trial's forces on the plate; none where a clock is not known."""
     if name not in sync.devices or "arm" not in sync.devices:

@@ -103,7 +103,7 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
             frames.stop()
             sent = server.finish(TAIL_S)
             _tail(trial, events, sent.events, sent.pulses)
-            trial.add_frames(frames.read())
+            trial.add("frames", frames.read())
             counts = frames.counts
             before = time.perf_counter()
             trial.seal()
@@ -143,9 +143,9 @@ def _loop(
     used = time.process_time()
     began = last = time.perf_counter()
     while last - began < seconds or not server.answered:
-        trial.add_events(events.read())
-        trial.add_event_pulses(events.read_pulses())
-        trial.add_frames(frames.read())
+        trial.add("events", events.read())
+        trial.add("events", events.read_pulses())
+        trial.add("frames", frames.read())
         memory.append(resident_mb())
         idle.wait(POLL_S)
         now = time.perf_counter()
@@ -169,8 +169,8 @@ def _tail(trial: TrialWriter, events: DvxplorerCamera, wanted: int, pulses: int)
             break
         idle.wait(POLL_S)
     events.stop()
-    trial.add_events(events.read())
-    trial.add_event_pulses(events.read_pulses())
+    trial.add("events", events.read())
+    trial.add("events", events.read_pulses())
 
 
 def _drop(folder: Path, size: int) -> Figures:
@@ -186,11 +186,11 @@ def _drop(folder: Path, size: int) -> Figures:
         for burst in (*BURSTS, 0):
             before = frames.counts.grabbed
             while frames.counts.grabbed < before + 5 and time.perf_counter() < end:
-                trial.add_frames(frames.read())
+                trial.add("frames", frames.read())
                 idle.wait(POLL_S)
             device.drop_frames(burst)
         frames.stop()
-        trial.add_frames(frames.read())
+        trial.add("frames", frames.read())
     finally:
         frames.close()
     trial.seal()
@@ -213,7 +213,7 @@ def _saturate(folder: Path, images: U8, count: int) -> float:
     chunk = FrameChunk(part, times, times, times, np.zeros(len(part), np.uint8))
     began = time.perf_counter()
     for _ in range(0, count, len(part)):
-        trial.add_frames(chunk)
+        trial.add("frames", chunk)
     trial.abandon()  # returns when all is written
     sync_file(trial.folder / SPOOL)
     taken = time.perf_counter() - began

@@ -109,7 +109,7 @@ def darker_lost(share: float) -> Change:
 
 
 def _kept(events: EventChunk, mask: npt.NDArray[np.bool_]) -> EventChunk:
-    return EventChunk(events.x[mask], events.y[mask], events.p[mask], events.t_us[mask])
+    return events[mask]
 
 
 def _merged(events: EventChunk, t_us: Any, x: Any, y: Any, p: Any) -> EventChunk:

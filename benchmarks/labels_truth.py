@@ -37,7 +37,7 @@ from sliplab.protocols.plan import load_plan
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.mock.fault_kinds import MarkerOccluded
 from sliplab.rigs.rig_file import RigFile, load_rig_file
-from sliplab.storage.streams import FrameChunk, Json
+from sliplab.storage.streams import Chunk, FrameChunk, Json
 
 ROOT = Path(__file__).parents[1]
 F64 = npt.NDArray[np.float64]
@@ -63,14 +63,10 @@ class _Eye:
         self._markers = MarkerTracker(self.layout)
         self._plate = PlateTracker() if self.plate else None
 
-    def __getattr__(self, name: str) -> Any:
-        """Every other stream goes nowhere."""
-        if not name.startswith("add_"):
-            raise AttributeError(name)
-        return lambda chunk: None
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Look at frames in order."""
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Look at frames in order; every other stream goes nowhere."""
+        if not isinstance(chunk, FrameChunk):
+            return
         self.t_ns.append(chunk.t_ns)
         if chunk.markers_px is not None:
             self.places.append(chunk.markers_px.astype(np.float64))

@@ -63,7 +63,7 @@ def hold_and_slide(
     devices.events.stop()
     parts.append(devices.events.read())
     devices.sync.stop()
-    return EventChunk.joined(parts)
+    return EventChunk.concatenate(parts)
 
 
 @cache

@@ -47,8 +47,7 @@ def _events(folder: Path, count: int, runs: int) -> Figures:
     def write() -> None:
         file = StreamFile(hdf5)
         for at in range(0, count, CHUNK):
-            part = slice(at, at + CHUNK)
-            file.add_events(EventChunk(data.x[part], data.y[part], data.p[part], data.t_us[part]))
+            file.add("events", data[at : at + CHUNK])
         file.finish()
 
     def read() -> EventChunk:

@@ -20,11 +20,11 @@ import numpy as np
 
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.build import simulated_rig
-from sliplab.rigs.levels import with_level
 from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.levels import with_level
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.streams import EventChunk, FrameChunk, NullSink
+from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink
 
 ROOT = Path(__file__).parent.parent
 WINDOW_US = 30_000
@@ -39,12 +39,12 @@ class Film(NullSink):
     images: list[Any] = field(default_factory=list)
     image_ns: list[int] = field(default_factory=list)
 
-    def add_events(self, chunk: EventChunk) -> None:
-        """Keep the events."""
-        self.events.append(chunk)
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Keep every fifth frame."""
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Keep the events and every fifth frame."""
+        if isinstance(chunk, EventChunk):
+            self.events.append(chunk)
+        if not isinstance(chunk, FrameChunk):
+            return
         for index in np.flatnonzero(chunk.number % 5 == 0).tolist():
             self.images.append(chunk.images[index].copy())
             self.image_ns.append(int(chunk.t_ns[index]))

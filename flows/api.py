@@ -1,286 +1,71 @@
-"""The public interface of `import sliplab`: stores, trials as arrays, and the analysis steps.
+"""The public interface of `import sliplab`: stores, trials as arrays, and what the commands do.
 
 A trial's arrays share one time line: int64 nanoseconds of the trial's sync box. Raw device times
-stay in the store (`storage.trials.recording.Recording`), for those who need them.
+stay in the store (`storage.trials.recording.Recording`), for those who need them. What a command
+does, its function or method does with the same arguments, errors and defaults, and returns what the
+command prints with ``--json``; a failed check is in the result, not an exception.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from sliplab.protocols import InputError, Plan, load_plan
+from sliplab.flows.notebook.html import pairs_html, table_html
+from sliplab.flows.notebook.plan import PlanView
+from sliplab.flows.notebook.trial import (
+    F64,
+    I64,
+    Events,
+    Onsets,
+    Poses,
+    Scalars,
+    Trial,
+    WindowCounts,
+)
+from sliplab.protocols import InputError, load_plan
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
-from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.recording import Recording
+from sliplab.storage.streams import EventChunk, Json
+from sliplab.storage.trials.store import STORE
 from sliplab.storage.trials.store import Store as TrialStore
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sliplab.analysis.force import PlateForces
     from sliplab.analysis.networks.training import Fitted
+    from sliplab.analysis.report.page import Figure
+    from sliplab.analysis.windows.sparse import SparseWindows
+    from sliplab.flows.notebook.datasets import EventDataset
+    from sliplab.flows.notebook.torch_windows import TorchWindows
+    from sliplab.flows.planning.preflight import Checks
     from sliplab.flows.steps import StepResult
+    from sliplab.flows.verify import Verified
+    from sliplab.protocols.windows import Windows
 
-I64 = npt.NDArray[np.int64]
-F64 = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Events:
-    """Events in time order, n of them."""
-
-    t_ns: I64
-    """Time line, nanoseconds, shape (n,), never decreasing."""
-    x: npt.NDArray[np.uint16]
-    """Column, pixels from the left, shape (n,)."""
-    y: npt.NDArray[np.uint16]
-    """Row, pixels from the top, shape (n,)."""
-    p: npt.NDArray[np.uint8]
-    """Polarity, shape (n,): 1 brighter, 0 darker."""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Poses of the tool centre point in the arm's base frame, n of them."""
-
-    t_ns: I64
-    """Time line, nanoseconds, shape (n,)."""
-    xyz_mm: F64
-    """Position, mm, shape (n, 3)."""
-    rotvec_deg: F64
-    """Rotation vector, degrees, shape (n, 3)."""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-
-@dataclass(frozen=True)
-class Scalars:
-    """Readings of one quantity, n of them."""
-
-    t_ns: I64
-    """Time line, nanoseconds, shape (n,)."""
-    value: F64
-    """Readings in `unit`, shape (n,)."""
-    unit: str
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-
-@dataclass(frozen=True)
-class Onsets:
-    """Onsets of incipient and gross slip in a trial, on its time line."""
-
-    incipient_ns: int | None
-    """First slip of any marker, nanoseconds; None when none slipped, or when it is in doubt."""
-    gross_ns: int | None
-    """Slip of the centre marker, nanoseconds; None when there was none, or when it is in doubt."""
-
-
-@dataclass(frozen=True)
-class WindowCounts:
-    """Output spikes of a network in consecutive windows of one trial, n of them."""
-
-    counts: I64
-    """Spikes of each class, shape (n, classes), in the order of `Model.classes`."""
-    end_ns: I64
-    """End of each window on the time line, nanoseconds, shape (n,)."""
-
-
-class Trial:
-    """One committed trial as arrays on one time line.
-
-    Attributes:
-        campaign: the campaign's name.
-        id: the trial's id; with the campaign it names the trial in its store.
-        recording: the trial as it is stored.
-    """
-
-    def __init__(self, store: TrialStore, campaign: str, recording: Recording) -> None:
-        self._store, self.campaign, self.recording = store, campaign, recording
-        self.id = recording.folder.name
-
-    def __repr__(self) -> str:
-        simulated = ", simulated" if self.simulated else ""
-        return f"<Trial {self.campaign}/{self.id}{simulated}>"
-
-    @property
-    def simulated(self) -> bool:
-        """True if a simulated rig made this trial."""
-        return self.recording.simulated
-
-    def streams(self) -> dict[str, str]:
-        """Kinds of the trial's streams by name: ``events``, ``frames``, ``scalar``, ``wrench``.
-
-        Those of the first cameras are named ``events`` and ``frames``, further ones as in the rig
-        file.
-        """
-        kinds = ("events", "frames", "scalar", "wrench")
-        return {name: kind for kind in kinds for name in self.recording.streams(kind)}
-
-    def events(
-        self, start_ns: int | None = None, end_ns: int | None = None, stream: str = "events"
-    ) -> Events:
-        """Events from `start_ns` to before `end_ns` of the time line; all of them by default.
-
-        Args:
-            stream: name of a further event camera's stream; the first camera's by default.
-
-        Raises:
-            StoreError: the trial is damaged, or has no such events.
-        """
-        found = self.recording.events(start_ns, end_ns, stream)
-        times = self.recording.clock(stream).to_reference(found.t_us * 1000)
-        return Events(np.asarray(times), found.x, found.y, found.p)
-
-    def poses(self) -> Poses:
-        """Poses of the arm, as its controller reported them.
-
-        Raises:
-            StoreError: the trial is damaged, or has no poses.
-        """
-        with self.recording.open() as reader:
-            found = reader.poses()
-        times = self.recording.clock("arm").to_reference(found.t_ns)
-        return Poses(np.asarray(times), found.xyz_mm, found.rotvec_deg)
-
-    def forces(self, stream: str = "force") -> PlateForces:
-        """Forces on the plate in its axes, and on the time line (see docs/force.md).
-
-        Args:
-            stream: name of a further force sensor's stream; the first sensor's by default.
-
-        Raises:
-            StoreError: the trial is damaged, or has no forces.
-        """
-        from sliplab.analysis.force import plate_forces
-
-        return plate_forces(self.recording, stream)
-
-    def scalars(self, stream: str) -> Scalars:
-        """Readings of a sensor of one quantity, such as a thermometer.
-
-        Raises:
-            StoreError: the trial is damaged, or has no such stream.
-        """
-        found = self.recording.scalars(stream)
-        times = self.recording.clock(stream).to_reference(found.t_ns)
-        return Scalars(np.asarray(times), found.value, found.unit)
-
-    def pulses(self) -> I64:
-        """Rising edges that the sync box made: nanoseconds on the time line, shape (n,)."""
-        with self.recording.open() as reader:
-            return reader.pulses("sync_pulses")
-
-    def frame_times(self, stream: str = "frames") -> I64:
-        """Middle of exposure of each frame: nanoseconds on the time line, shape (n,).
-
-        Args:
-            stream: name of a further frame camera's stream; the first camera's by default.
-        """
-        return self.recording.frame_times(stream)
-
-    def frames(self, stream: str = "frames") -> Iterator[npt.NDArray[np.uint8]]:
-        """The video's frames in order, each uint8 of shape (height, width).
-
-        Args:
-            stream: as in `frame_times`.
-
-        Raises:
-            StoreError: the trial is damaged, or holds no such video.
-        """
-        self._check_video(stream)
-        return self.recording.frames(stream=stream)
-
-    def frame(self, index: int, stream: str = "frames") -> npt.NDArray[np.uint8]:
-        """One frame of the video, uint8 of shape (height, width).
-
-        Args:
-            stream: as in `frame_times`.
-
-        Raises:
-            StoreError: the trial is damaged, or holds no such video.
-            IndexError: the video is not that long.
-        """
-        self._check_video(stream)
-        return self.recording.frame(index, stream)
-
-    def _check_video(self, stream: str) -> None:
-        if stream != "frames":
-            if self.recording.video(stream) is None:
-                raise StoreError(f"{self.recording.folder}: stream '{stream}' has no video")
-        elif not self.recording.has_video:
-            raise StoreError(
-                f"{self.recording.folder}: has no video; its camera provided "
-                f"{self.recording.frame_source}"
-            )
-
-    def step(self, phase: str) -> tuple[int, int]:
-        """Start and end of a phase of the motion on the time line, nanoseconds.
-
-        Raises:
-            KeyError: the motion has no such phase.
-        """
-        return self.recording.step(phase)
-
-    @cached_property
-    def label(self) -> dict[str, Any]:
-        """The trial's label as it is stored (`sliplab schema label` prints its keys).
-
-        Raises:
-            StoreError: the trial has no label yet.
-        """
-        try:
-            return Derived.of(self._store, "labels", self.campaign).read(self.id)
-        except FileNotFoundError:
-            raise self._unlabelled() from None
-
-    def onsets(self) -> Onsets:
-        """The onsets of the label, by the rule that the protocol names.
-
-        Raises:
-            StoreError: the trial has no label yet.
-        """
-        return Onsets(self.label["incipient_ns"], self.label["gross_ns"])
-
-    def displacements(self) -> tuple[I64, F64]:
-        """Displacement of each of m markers, from which slip is detected.
-
-        Returns:
-            times of n frames on the time line, int64 nanoseconds, shape (n,); displacements in
-            pixels, shape (n, m), NaN where a marker was not seen.
-
-        Raises:
-            StoreError: the trial has no label yet, or one that came with its recording.
-        """
-        try:
-            found = Derived.of(self._store, "labels", self.campaign).arrays(self.id)
-        except FileNotFoundError:
-            raise self._unlabelled() from None
-        if "displacement_px" not in found:
-            raise StoreError(
-                f"{self.campaign}/{self.id}: its label came with the recording, so no marker was "
-                "tracked"
-            )
-        return found["frame_ns"], found["displacement_px"].astype(np.float64)
-
-    def _unlabelled(self) -> StoreError:
-        return StoreError(
-            f"{self.campaign}/{self.id}: has no label yet; run `sliplab label` or `Store.label()`"
-        )
+__all__ = [
+    "F64",
+    "I64",
+    "Events",
+    "Model",
+    "Onsets",
+    "Poses",
+    "Scalars",
+    "Store",
+    "Trial",
+    "WindowCounts",
+    "check",
+    "collect",
+    "export",
+    "import_data",
+    "load_model",
+    "open_store",
+    "plan",
+    "verify",
+]
 
 
 class Store:
@@ -328,22 +113,10 @@ class Store:
             campaign: needed where several campaigns have a trial of this id.
 
         Raises:
-            StoreError: it does not exist, or more than one.
+            NoTrial: it does not exist, or more than one; a StoreError and an InputError.
         """
-        found = [
-            item
-            for item in self._store.campaigns()
-            if campaign in (None, item.name) and trial_id in item.committed()
-        ]
-        if len(found) != 1:
-            where = ", ".join(item.name for item in found)
-            raise StoreError(
-                f"{self.folder}: trial {trial_id}: is in several campaigns ({where}): name one"
-                if found
-                else f"{self.folder}: trial {trial_id}: no such trial"
-                + ("" if campaign is None else f" in campaign {campaign}")
-            )
-        return Trial(self._store, found[0].name, found[0].recording(trial_id))
+        found = self._store.holder(trial_id, campaign)
+        return Trial(self._store, found.name, found.recording(trial_id))
 
     def __iter__(self) -> Iterator[Trial]:
         """All committed trials, by campaign and id."""
@@ -363,9 +136,128 @@ class Store:
         """Train the network on the labelled kinematic trials."""
         return self._run("train", campaigns)
 
-    def evaluate(self, campaigns: Sequence[str] | None = None) -> StepResult:
-        """Judge the network on test trials."""
-        return self._run("evaluate", campaigns)
+    def evaluate(
+        self,
+        campaigns: Sequence[str] | None = None,
+        *,
+        predictions: pd.DataFrame | str | Path | None = None,
+        model: str | Path | None = None,
+        **options: Any,
+    ) -> dict[str, Any]:
+        """Judge the network on test trials; or a model file, or any model by its predictions.
+
+        Args:
+            predictions: a row for each window that `windows` lists for ``test``, as a table or its
+                file; docs/models.md describes its columns.
+            model: a model file.
+            options: of ``sliplab evaluate``: ``margin``, ``smoothing``, ``reviewed``,
+                ``baselines``, ``checks``, ``engine``, ``dask``.
+
+        Raises:
+            InputError: an argument, or predictions that do not fit, with all their faults.
+        """
+        from sliplab.flows.evaluations import run_evaluation
+        from sliplab.flows.running import extras, stopping
+
+        if isinstance(predictions, str):
+            predictions = Path(predictions)
+        options |= {"predictions": predictions, "model": None if model is None else Path(model)}
+        names = None if campaigns is None else list(campaigns)
+        with stopping.signals(), extras.named("Store.evaluate"):
+            return run_evaluation(self.folder, names, **options)
+
+    def windows(
+        self, split: str | None = None, campaigns: Sequence[str] | None = None
+    ) -> pd.DataFrame:
+        """The windows by which models are trained and judged, by trial and time.
+
+        Args:
+            split: ``train``, ``validation`` or ``test``; all of them by default.
+
+        Returns:
+            a row for each window: ``campaign``, ``trial``, ``split``; ``start_ns`` and ``end_ns``
+            on the trial's time line; ``run``: slip is detected in it; ``label``: its class
+            (``no_slip``, ``incipient``, ``gross``) where it is a sample, else None.
+
+        Raises:
+            InputError: there is no such part of the split.
+            StoreError: a trial has no label yet, or there are no slides with events.
+        """
+        from sliplab.analysis.campaigns import collected, need_slip
+        from sliplab.analysis.labels.reviewed import StoreLabels
+        from sliplab.analysis.windows.window_table import SPLITS, window_table
+        from sliplab.protocols.shown import one_of
+
+        if split is not None and split not in SPLITS:
+            raise InputError("split", "", split, one_of(split, SPLITS))
+        found = collected(self._store, None if campaigns is None else list(campaigns))
+        need_slip(found)
+        return window_table(StoreLabels(self._store), found, SPLITS if split is None else (split,))
+
+    def torch_dataset(
+        self, split: str = "train", *, windows: pd.DataFrame | None = None
+    ) -> TorchWindows:
+        """Event counts of windows and their classes, for PyTorch's ``DataLoader``.
+
+        Args:
+            split: whose labelled windows are taken.
+            windows: take these rows of `windows` instead; the class of one without is -1.
+
+        Raises:
+            ModuleNotFoundError: the extra ``learn`` is not installed.
+            InputError, StoreError: as `windows`.
+        """
+        from sliplab.flows.running import extras
+
+        with extras.named("Store.torch_dataset"):
+            from sliplab.flows.notebook.torch_windows import TorchWindows
+        table = self._windows(split, windows)
+        return TorchWindows(self._counts(table), table)
+
+    def tonic_dataset(
+        self,
+        split: str = "train",
+        *,
+        windows: pd.DataFrame | None = None,
+        transform: Callable[[Any], Any] | None = None,
+        target_transform: Callable[[Any], Any] | None = None,
+    ) -> EventDataset:
+        """Events of windows and their classes, as tonic's transforms take them.
+
+        Args:
+            split, windows: as `torch_dataset`.
+            transform, target_transform: applied to each item's events and to its class.
+
+        Raises:
+            InputError, StoreError: as `windows`.
+        """
+        from sliplab.flows.notebook.datasets import EventDataset
+
+        table, length_ns = self._windows(split, windows), self._settings().length_ms * 1_000_000
+        return EventDataset(self._store, table, length_ns, transform, target_transform)
+
+    def _windows(self, split: str, windows: pd.DataFrame | None) -> pd.DataFrame:
+        from sliplab.flows.notebook.datasets import labelled
+
+        return labelled(self.windows(split)) if windows is None else windows
+
+    def _settings(self) -> Windows:
+        from sliplab.analysis.campaigns import collected, training_campaigns
+
+        return training_campaigns(collected(self._store))[0].settings.windows
+
+    def _counts(self, windows: pd.DataFrame, shape: Windows | None = None) -> SparseWindows:
+        from sliplab.flows.notebook.datasets import event_counts
+
+        return event_counts(self._store, windows, shape or self._settings())
+
+    def verify(self, *, quarantine: bool = False) -> Verified:
+        """Check every checksum, count and clock of the store; see `sliplab.verify`."""
+        return verify(self.folder, quarantine=quarantine)
+
+    def export(self, form: str, output: str | Path, part: str = "", **options: Any) -> Json:
+        """Write trials or the store in a form of other programs; see `sliplab.export`."""
+        return export(self.folder, form, output, part, **options)
 
     def report(self, campaigns: Sequence[str] | None = None) -> Path:
         """Write the report; returns its page."""
@@ -387,6 +279,32 @@ class Store:
         """Files of the networks that were trained here."""
         return sorted((self.folder / "models").glob("*.pt"))
 
+    def plot(self, campaign: str | None = None) -> Figure:
+        """Event rate, tightest gate and failed attempts over a campaign, as in the report.
+
+        Args:
+            campaign: the first one by default.
+
+        Raises:
+            InputError: there is no such campaign. StoreError: there is none.
+            ModuleNotFoundError: the extra ``report`` is not installed.
+        """
+        from sliplab.analysis.campaigns import collected
+        from sliplab.flows.running import extras
+
+        with extras.named("Store.plot"):
+            from sliplab.analysis.report.campaign import campaign_figure
+        item = collected(self._store, None if campaign is None else [campaign])[0]
+        stream = "frames" if item.missing_stream == "events" else "events"
+        return campaign_figure(item, stream, bool(item.info["simulated"]))
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (item.name, len(item.committed()), "yes" if item.info["simulated"] else "no")
+            for item in self._store.campaigns()
+        ]
+        return table_html(f"Store {self.folder}", ("campaign", "trials", "simulated"), rows)
+
     def _run(self, step: str, campaigns: Sequence[str] | None) -> StepResult:
         from sliplab.flows.running import extras, stopping
         from sliplab.flows.steps import run_step
@@ -398,8 +316,54 @@ class Store:
 class Model:
     """A trained network, run on events by the event-driven kernels."""
 
-    def __init__(self, fitted: Fitted) -> None:
-        self.fitted = fitted
+    def __init__(self, fitted: Fitted, simulated: bool = False) -> None:
+        self.fitted, self.simulated = fitted, simulated
+
+    def __repr__(self) -> str:
+        simulated = ", simulated" if self.simulated else ""
+        return f"<Model of {', '.join(self.classes)}; seed {self.fitted.seed}{simulated}>"
+
+    def _repr_html_(self) -> str:
+        chosen, windows = self.fitted.chosen, self.fitted.windows
+        pairs = {
+            "window": f"{windows.length_ms} ms in {windows.steps} steps",
+            "cells": f"{windows.channels} x {windows.cells} x {windows.cells}",
+            "epoch": f"{chosen.epoch} of {len(self.fitted.history)}",
+            "validation accuracy, strict": f"{chosen.val_strict:.1%}",
+            "warnings": "; ".join(self.fitted.warnings) or "none",
+        }
+        return pairs_html(repr(self), pairs)
+
+    def plot(self) -> Figure:
+        """Loss and accuracy over the epochs of its training, as in the report.
+
+        Raises:
+            ModuleNotFoundError: the extra ``report`` is not installed.
+        """
+        from dataclasses import asdict
+
+        from sliplab.flows.running import extras
+
+        with extras.named("Model.plot"):
+            from sliplab.analysis.report.windows import training_figure
+        history = [asdict(record) for record in self.fitted.history]
+        return training_figure(history, self.fitted.chosen_epoch, simulated=self.simulated)
+
+    def predict(self, store: Store, split: str = "test") -> pd.DataFrame:
+        """Output spikes in a store's windows, as `Store.evaluate` takes predictions.
+
+        Raises:
+            InputError: the network tells other classes than those of slip.
+            StoreError: see `Store.windows`.
+        """
+        from sliplab.analysis.evaluation.predictions import COLUMNS
+        from sliplab.analysis.networks import training
+
+        self.fitted.check_slip("model", "a prediction of slip")
+        windows = store.windows(split)
+        counts = training.predict_counts(self.fitted, store._counts(windows, self.fitted.windows))
+        columns = dict(zip(COLUMNS["spikes"], counts.T, strict=True))
+        return windows[["campaign", "trial", "start_ns"]].assign(**columns)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -481,10 +445,13 @@ def load_model(path: str | Path) -> Model:
     with extras.named("load_model"):
         from sliplab.analysis.networks import model_file
 
-    return Model(model_file.load(Path(path)))
+    place = Path(path)
+    made_in = place.parent.parent  # of STORE/models/NAME.pt
+    stored = (made_in / STORE).is_file() and TrialStore.open(made_in).simulated
+    return Model(model_file.load(place), stored)
 
 
-def plan(protocol: str | Path, enable: Iterable[str] = ()) -> Plan:
+def plan(protocol: str | Path, enable: Iterable[str] = ()) -> PlanView:
     """Expand a protocol to its trials, in the order in which they are taken.
 
     Args:
@@ -494,7 +461,124 @@ def plan(protocol: str | Path, enable: Iterable[str] = ()) -> Plan:
     Raises:
         InputError: the protocol is wrong; the message names file, key, value and what is right.
     """
-    return load_plan(Path(protocol), tuple(enable))
+    found = load_plan(Path(protocol), tuple(enable))
+    return PlanView(found.protocol, found.file, found.enabled, found.trials)
+
+
+def check(
+    protocol: str | Path, rig: str | Path, store: str | Path, *, enable: Iterable[str] = ()
+) -> Checks:
+    """Check everything that can be checked before anything moves, as ``sliplab check`` does.
+
+    Args:
+        protocol, rig, store, enable: as `collect`.
+
+    Returns:
+        ``passed``, and ``checks``: each with its name, whether it passed, and its finding.
+
+    Raises:
+        InputError: protocol or rig file cannot be used at all.
+    """
+    from sliplab.flows.planning import preflight
+    from sliplab.flows.running import extras
+
+    with extras.named("check"):
+        found = preflight.check(Path(protocol), Path(rig), Path(store), tuple(enable))
+    return preflight.checks_json(found)
+
+
+def verify(place: str | Path, *, quarantine: bool = False) -> Verified:
+    """Check every checksum, count and clock of a store, as ``sliplab verify`` does.
+
+    Args:
+        place: its folder, or the URL of a pushed one.
+        quarantine: move damaged trials to quarantine, to be retaken.
+
+    Returns:
+        ``ok``, ``problems`` and so on; damage is in the result, not an exception.
+
+    Raises:
+        InputError: there is no store, or `quarantine` was given with a URL.
+    """
+    from sliplab.flows.verify import verify as run
+
+    return run(str(place), quarantine)
+
+
+def import_data(
+    path: str | Path,
+    store: str | Path,
+    *,
+    kind: str | None = None,
+    name: str | None = None,
+    adapter: str | Path | None = None,
+    dry_run: bool = False,
+    simulated: bool = False,
+    salvage: bool = False,
+) -> Json:
+    """Import recordings of other programs, as ``sliplab import`` does.
+
+    Args:
+        path: a file, or a folder of files; with an adapter also a ``.zip``.
+        store: the store's folder; made if missing.
+        kind: name of the format; by default the content decides.
+        name: the new campaign's; by default the adapter's.
+        adapter: of a data set with labels and factors (docs/adapters.md).
+        dry_run: with an adapter: return what would be imported.
+        simulated: mark the trials as simulated.
+        salvage: import the undamaged beginning of a damaged file.
+
+    Returns:
+        ids in ``imported`` and ``there``, faults in ``failed`` and ``warnings``, and so on.
+
+    Raises:
+        InputError: an argument, or data that cannot be right.
+        ModuleNotFoundError: an extra is not installed; the message says which.
+    """
+    from sliplab.flows.imports import import_data as run
+    from sliplab.flows.running import extras
+
+    with extras.named("import_data"):
+        return run(
+            Path(path),
+            Path(store),
+            kind=kind,
+            name=name,
+            adapter=None if adapter is None else Path(adapter),
+            dry_run=dry_run,
+            simulated=simulated,
+            salvage=salvage,
+        )
+
+
+def export(
+    place: str | Path, form: str, output: str | Path, part: str = "", **options: Any
+) -> Json:
+    """Write trials, a store or a network in a form of other programs, as ``sliplab export`` does.
+
+    Args:
+        place: a store's folder or URL, or a model's file.
+        form: its name, such as ``aedat4``, ``dsec``, ``labels`` or ``croissant``.
+        output: folder to write, or file for labels.
+        part: a campaign or a trial of the store, where the form is of one.
+        options: of the form: ``campaign``, ``title``, ``creator``, ``licence``, ``stream``,
+            ``store``, ``windows``.
+
+    Returns:
+        what was written.
+
+    Raises:
+        InputError: the form, an option, or a part that is missing or too much.
+        StoreError: the store does not have what the form needs.
+        ModuleNotFoundError: an extra is not installed; the message says which.
+    """
+    from sliplab.flows import exports
+    from sliplab.flows.running import extras
+
+    given = {name: value for name, value in options.items() if value is not None}
+    with extras.named("export"):
+        request = exports.ExportRequest(str(place), part, form, Path(output), given)
+        return dict(exports.export(request).result)
 
 
 def collect(

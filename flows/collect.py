@@ -60,6 +60,7 @@ def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) 
 def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
     """Collect the missing trials of a campaign."""
     request = run_request.content
+    several = "trials from " if request.rig.in_virtual_time else "trial "
     with (
         shown(request) as progress,
         open_session(request, progress) as session,
@@ -73,7 +74,9 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
             while trials:
                 taken = 0
                 while taken < len(trials):
-                    taken += take_trials(Opaque(collector), Opaque(trials[taken:]))
+                    first = trials[taken].id
+                    batch = take_trials.with_options(task_run_name=f"{several}{first}")
+                    taken += batch(Opaque(collector), Opaque(trials[taken:]))
                 begun += len(trials)
                 room = None if request.most is None else request.most - begun
                 trials = session.more()[:room] if room != 0 else []

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sliplab.flows.running import console
+from sliplab.flows.steps import located
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
@@ -120,7 +121,8 @@ def check_export(request: ExportRequest) -> Export:
     for name in request.options:
         if name not in form.options:
             holders = [each for each in export_names() if name in known_export(each).options]
-            text = f"does not belong to --as {request.form}; it is of {', '.join(holders)}"
+            it_is = f"it is of {', '.join(holders)}" if holders else "no form has it"
+            text = f"does not belong to --as {request.form}; {it_is}"
             raise InputError(f"--{name}", "", None, text)
     place, taken = Path(request.place), f"--as {request.form} is of {TITLES[form.of]}"
     if place.exists() and place.is_dir() == (form.of == "model"):
@@ -133,6 +135,19 @@ def check_export(request: ExportRequest) -> Export:
     return form
 
 
+def export(request: ExportRequest) -> ExportResult:
+    """Write what a request asks for.
+
+    Raises:
+        InputError: see `check_export`.
+        StoreError: the store does not have what the form needs.
+    """
+    form = check_export(request)
+    if form.of != "model":
+        request = replace(request, place=str(located(request.place)))
+    return form.write(request)
+
+
 def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     """Return a store, a campaign of it, and the requested trials."""
     from sliplab.storage.remote.mirror import open_store
@@ -142,7 +157,7 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
     if part in campaigns:
         return opened, campaigns[part], sorted(campaigns[part].committed())
-    holders = [item for item in campaigns.values() if part in item.committed()]
+    holders = opened.holders(part)
     if len(holders) != 1:
         text = (
             "is in several campaigns; name a trial or another campaign"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from prefect import flow
 
@@ -31,6 +31,8 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from sliplab.flows.running.cluster import Cluster
 
 
@@ -57,7 +59,7 @@ class NetworkScores(StepResult):
     """
 
     model: str
-    engine: Engines
+    engine: Engines | Literal["predictions"]
     same_as_sinabs: bool
     simulated: bool
     margin: dict[str, float]
@@ -97,7 +99,38 @@ def judge_model(
             f"warning: {network.title}: its weights are off the grid, where the fast engine's "
             "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
         )
+    return _scores(judgement, cluster)
+
+
+def judge_predictions(
+    store: Store,
+    campaigns: list[Collected],
+    predictions: Path | pd.DataFrame,
+    margin: float | None = None,
+    smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> NetworkScores:
+    """Judge any model by its predictions for the test windows, as `judge_model` judges one.
+
+    Args:
+        predictions: their table or its file; see `analysis.evaluation.predictions`.
+
+    Raises:
+        InputError: the table; all its faults at once.
+        StoreError: a trial has no label yet.
+    """
+    from sliplab.analysis.evaluation.predictions import predicted
+
+    need_slip(campaigns)
+    labels = StoreLabels(store, reviewed)
+    return _scores(predicted(labels, campaigns, predictions, margin, smoothing), cluster)
+
+
+def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
+    """Judge a network, and return its stored figures."""
     done = _judge(judgement, cluster)
+    store, campaigns, network = judgement.store, judgement.campaigns, judgement.network
     found = Derived.of(store, networks.STEP).load(network.name, OtherEvaluation)
     experiments = summaries(found.trials)
     kinematic = experiments["kinematic"]
@@ -117,7 +150,7 @@ def judge_model(
         "lead_ms": {
             name: scores.lead_ms for name, scores in experiments.items() if name != "kinematic"
         },
-        **report_states(labels, campaigns),
+        **report_states(judgement.labels, campaigns),
     }
 
 

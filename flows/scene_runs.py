@@ -9,7 +9,7 @@ faults.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -21,7 +21,7 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.mock.settings import ClockErrors
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
+from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 
 MOTION = frozenset(ACTING)
 PERFECT = ClockErrors(
@@ -93,17 +93,14 @@ class Memory(NullSink):
     poses: list[PoseChunk] = field(default_factory=list)
     forces: list[WrenchChunk] = field(default_factory=list)
 
-    def add_events(self, chunk: EventChunk) -> None:
-        self.events.append(chunk)
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        self.frames.append(chunk)
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        self.poses.append(chunk)
-
-    def add_stream(self, name: str, chunk: Any) -> None:
-        if name == "force" and isinstance(chunk, WrenchChunk):
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, EventChunk):
+            self.events.append(chunk)
+        elif isinstance(chunk, FrameChunk):
+            self.frames.append(chunk)
+        elif isinstance(chunk, PoseChunk):
+            self.poses.append(chunk)
+        elif isinstance(chunk, WrenchChunk) and device == "force":
             self.forces.append(chunk)
 
 
@@ -124,7 +121,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
         built.close()
     start_ns = next(step.start_ns for step, _ in done.steps if step.phase in MOTION)
     begin_us, end_us = ((t - start_ns) // 1000 for t in done.recorded_ns)
-    events, truth = EventChunk.joined(sink.events), done.truth
+    events, truth = EventChunk.concatenate(sink.events), done.truth
     assert truth is not None, "a simulated rig has a truth"
     t_us = events.t_us - start_ns // 1000
     inside = slice(*np.searchsorted(t_us, (begin_us, end_us)))
@@ -135,7 +132,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
         return after if after is not None and after <= end_us * 1000 else None
 
     return SceneRun(
-        events=EventChunk(events.x[inside], events.y[inside], events.p[inside], t_us[inside]),
+        events=replace(events, t_us=t_us)[inside],
         size_px=(built.events.width, built.events.height),
         begin_us=begin_us,
         end_us=end_us,

@@ -37,11 +37,36 @@ STEPS = {
     "train": "sliplab.flows.train",
     "evaluate": "sliplab.flows.evaluate",
     "judge_model": "sliplab.flows.judge_network",
+    "judge_predictions": "sliplab.flows.judge_network",
     "window_baselines": "sliplab.flows.window_checks",
     "window_checks": "sliplab.flows.window_checks",
     "report": "sliplab.flows.report",
 }
 """The module of each step; its function has the step's name."""
+
+
+def located(place: str) -> Path:
+    """Return a store's folder: the folder itself, or the updated mirror of a URL.
+
+    Raises:
+        StoreError: it does not exist.
+    """
+    from sliplab.storage.remote.mirror import open_mirror
+    from sliplab.storage.remote.objects import is_url
+
+    if not is_url(place):
+        return Path(place)
+    with console.bar(f"read {place} (trials)", 0) as bar:
+
+        def seen(name: str) -> None:
+            bar.extend(1)
+            bar.advance(1, name)
+
+        store, done = open_mirror(place, seen)
+    for problem in done.problems:
+        console.say(f"skipped: {problem}")
+    console.say(f"working on {store.folder}; events and videos are downloaded when first read")
+    return store.folder
 
 
 def prepare_store(folder: Path) -> None:

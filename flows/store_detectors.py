@@ -6,11 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
-from sliplab.analysis.detectors.detectors import RULE, Levels, Smoothing, Tuned
+from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
+from sliplab.analysis.detectors.smoothing_rule import paper_rule
 from sliplab.analysis.evaluation.detectors import detector_work
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import (
@@ -23,7 +22,6 @@ from sliplab.analysis.networks.models import (
 )
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
-from sliplab.protocols.detection import Detection
 from sliplab.protocols.shown import one_of
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -39,7 +37,7 @@ class NetworkDetectors:
 
     title: str
     model: ModelOnDisk
-    detectors: list[tuple[int, Tuned]]
+    detectors: Sequence[tuple[int, Tuned]]
 
 
 def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[NetworkDetectors]:
@@ -54,7 +52,7 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
     model, settings = choose_model(wanted_models(store, campaigns)), training_settings(campaigns)
     rules = rules_of(campaigns, settings.network.outputs_per_class)
     rule = rules[training_campaigns(campaigns)[0].name]
-    detectors = [(settings.stride_ms, _with_rule(rule))]
+    detectors: list[tuple[int, Tuned]] = [(settings.stride_ms, paper_rule(rule))]
     work = detector_work(StoreLabels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
@@ -63,7 +61,7 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
     yield NetworkDetectors(OWN, model, detectors)
     for other in _others(store, campaigns):
         theirs = other.settings
-        with_rule = [(theirs.stride_ms, _with_rule(theirs.detection))]
+        with_rule = [(theirs.stride_ms, paper_rule(theirs.detection))]
         yield NetworkDetectors(f"preset: {theirs.preset}", other, with_rule)
 
 
@@ -73,12 +71,6 @@ def _others(store: Store, campaigns: list[Collected]) -> Iterator[ModelOnDisk]:
         if not other.fresh:
             raise StoreError(f"{other.path}: is missing or stale; run `sliplab train` first")
         yield other
-
-
-def _with_rule(rule: Detection) -> Tuned:
-    """The protocol's rule as a detector: its level is the margin, which is enough."""
-    level = float(np.nextafter(rule.margin, -np.inf))
-    return Tuned(f"{RULE}{rule.smoothing} windows", Smoothing(rule.smoothing), Levels(level, level))
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,8 @@ def train_flow(
                 raise StoreError(f"there are no {name} samples; collect more trials")
         _warn_of_missing(models[0].classes, train)
         for model in models:
-            train_one(Opaque((model, train, validation, simulated)))
+            train_model = train_one.with_options(task_run_name=f"train {model.title}")
+            train_model(Opaque((model, train, validation, simulated)))
     return len(models)
 
 

@@ -118,6 +118,8 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
             expected += f" and reads as {reads}: quote it"
     if kind == "literal_error" and isinstance(value, str):
         expected += did_you_mean(value, re.findall("'([^']*)'", expected))
+    if context.get("ge") == -(2**63) or context.get("lt") == 2**63:
+        expected = "must fit 64 bits"
     if context.get("pattern") == NAME_PATTERN:
         expected = f"must be {NAME_WORDS} (pattern {NAME_PATTERN})"
     return KeyedError(key, value, expected)

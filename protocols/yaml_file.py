@@ -47,7 +47,6 @@ from sliplab.protocols.shown import (
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
-Chosen = TypeVar("Chosen", bound=BaseModel)
 
 
 class StrictModel(BaseModel):
@@ -544,14 +543,18 @@ class ChosenModel(ABC):
     """Annotation of a field with one of several models, chosen by what is in the value."""
 
     @abstractmethod
-    def read(self, value: Any) -> BaseModel:
-        """Return the model in `value`, checked by `checked`."""
+    def choose(self, value: dict[str, Any]) -> type[BaseModel]:
+        """Return the model for a mapping. Raises KeyedError, its key below the field's."""
 
-    @staticmethod
-    def checked(model: type[Chosen], value: Any) -> Chosen:
-        """Validate a value by the chosen model. Raises KeyedError, its key below the field's."""
+    def read(self, value: Any, info: ValidationInfo) -> BaseModel:
+        """Return the settings in `value`. Raises KeyedError."""
+        if isinstance(value, BaseModel):
+            return value
+        if not isinstance(value, dict):
+            raise ValueError("must be a mapping (key: value)")
+        model = self.choose(value)
         try:
-            return model.model_validate(value)
+            return model.model_validate(value, context=info.context)
         except ValidationError as error:
             found = faults_below(model, error)
         raise KeyedError.joined(found)
@@ -559,7 +562,7 @@ class ChosenModel(ABC):
     def __get_pydantic_core_schema__(
         self, source: Any, handler: Callable[[Any], CoreSchema]
     ) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(
+        return core_schema.with_info_plain_validator_function(
             self.read,
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda model: model.model_dump(mode="json")

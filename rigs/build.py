@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.timing import ForceTiming
 from sliplab.rigs.core.arm_settings import BaseArmSettings, PlaneSettings
 from sliplab.rigs.core.capabilities import (
@@ -17,82 +16,37 @@ from sliplab.rigs.core.capabilities import (
     Gripper,
     Operator,
     Plate,
-    PlateCourse,
     Pose,
     RigError,
-    Truth,
+    Simulation,
 )
+from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.driver import (
     EventCameraDriver,
     ForceSensorDriver,
     FrameCameraDriver,
+    RigDriver,
     ScalarSensorDriver,
-)
-from sliplab.rigs.core.further import (
-    FurtherEvents,
-    FurtherForces,
-    FurtherFrames,
-    FurtherScalars,
-    FurtherStream,
 )
 from sliplab.rigs.core.guard import Guard, PlateLimits
 from sliplab.rigs.core.host_clock import HostClock
 from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.discovery import need_libraries, need_video
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.truth import plate_course, watch_plate
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import (
     EventStream,
     ForceStream,
     FrameStream,
     Stream,
-    simulated_streams,
 )
 from sliplab.storage.schema.trial import StreamRecord
-from sliplab.storage.streams import Sink
-
-if TYPE_CHECKING:
-    from sliplab.rigs.loopback.client import Loopback
-
 
 DRIVEN_TAIL_S = 0.3
 """Time for which real drivers are read after the last pulse, s."""
-
-
-class _MockSimulation:
-    """The simulated world, in the time of the arm controller's clock."""
-
-    def __init__(self, devices: MockDevices) -> None:
-        self._devices = devices
-
-    def begin_trial(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
-        """Draw what varies by trial from `seed`."""
-        self._devices.begin_trial(seed, nuisances)
-
-    def sink(self, sink: Sink) -> Sink:
-        """Return the sink of the recording in this world."""
-        return self._devices.sink(sink)
-
-    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
-        """Return the ground truth of a trial, counted from these times."""
-        clock = self._devices.world.clocks.arm
-        hold_ns = None if hold_arm_ns is None else int(clock.to_device(hold_arm_ns))
-        return self._devices.truth(int(clock.to_device(reference_arm_ns)), hold_ns)
-
-    def watch_plate(self) -> None:
-        """Keep the forces on the plate from now on."""
-        watch_plate(self._devices.world)
-
-    def plate_course(self, since_arm_ns: int) -> PlateCourse:
-        """Return the plate's course since an arm controller time."""
-        world = self._devices.world
-        return plate_course(world, int(world.clocks.arm.to_device(since_arm_ns)))
-
-
 ShouldStop = Callable[[], bool]
 
 
@@ -112,44 +66,9 @@ def build_rig(file: RigFile, should_stop: ShouldStop = never) -> Rig:
         ModuleNotFoundError: a maker's library, or one for video, is not installed.
     """
     need_video(file)
-    if file.driver == "mock":
-        further = simulated_streams(file.streams)
-        return simulated_rig(file, build_mock(file.scene, file.timing, further), should_stop)
-    assert file.devices is not None
-    need_libraries(file.devices, file.streams)
-    if file.driver == "loopback":
-        return _loopback_rig(file, file.devices, should_stop)
-    return _real_rig(file, file.devices, should_stop)
-
-
-def simulated_rig(file: RigFile, devices: MockDevices, should_stop: ShouldStop = never) -> Rig:
-    """Build the rig that a rig file describes on the given simulated devices."""
-    return Rig(
-        name=file.name,
-        clock=devices.clock,
-        arm=devices.arm,
-        event_camera=devices.events if "events" in file.cameras else None,
-        frame_camera=devices.frames if "frames" in file.cameras else None,
-        sync=devices.sync,
-        operator=devices.operator,
-        plate_frame=taught_frame(file),
-        poll_s=float(file.poll),
-        timing=file.timing,
-        touch_mm=file.calibration.touch_depth,
-        centre_px=file.calibration.centre_px,
-        plate=devices.plate,
-        force=devices.force,
-        force_limit_n=force_limit(file),
-        guard=Guard(None, plate_limits(file)),
-        further=tuple(
-            further_stream(name, file.streams[name], device, taught_frame(file))
-            for name, device in devices.further.items()
-        ),
-        gripper=devices.gripper,
-        grip_opening_mm=file.grip_opening_mm or 0.0,
-        simulation=_MockSimulation(devices),
-        should_stop=should_stop,
-    )
+    if file.devices is not None:
+        need_libraries(file.devices, file.streams)
+    return find_driver(file.driver, RigDriver).build(file, should_stop)
 
 
 def taught_frame(file: RigFile) -> PlateFrame:
@@ -179,63 +98,40 @@ def calibrated_arm(file: RigFile, devices: DeviceSettings) -> BaseArmSettings:
     return arm.model_copy(update={"limits": limits, "tool": tool})
 
 
-def _real_rig(file: RigFile, devices: DeviceSettings, should_stop: ShouldStop) -> Rig:
-    console = ConsoleOperator()
-    person = PersonAtPlate(console, devices.plate.mass_kg) if devices.plate else None
-    return _driven_rig(file, devices, person or console, person, None, should_stop)
-
-
-def _loopback_rig(file: RigFile, devices: DeviceSettings, should_stop: ShouldStop) -> Rig:
-    """Build a rig of real drivers; fakes in a separate process show the simulated scene."""
-    from sliplab.rigs.loopback.client import Loopback
-
-    with ExitStack() as undo:
-        stage = Loopback(file.scene, file.timing, devices, file.streams)
-        undo.callback(stage.close)
-        rig = loopback_rig(file, stage, should_stop, (stage.close,))
-        undo.pop_all()
-    return rig
-
-
-def loopback_rig(
-    file: RigFile,
-    stage: Loopback,
-    should_stop: ShouldStop = never,
-    on_close: tuple[Callable[[], None], ...] = (),
-) -> Rig:
-    """Build a rig of real drivers on running fakes, which stay the caller's to close.
-
-    Args:
-        file: a `loopback` rig file with the arm and the scene that `stage` simulates.
-        on_close: called last when the rig is closed.
-
-    Raises:
-        RigError: a fake cannot be reached.
-    """
+def build_real(file: RigFile, should_stop: ShouldStop) -> Rig:
+    """Build a rig of real devices, whose plate an operator moves. Raises RigError."""
     assert file.devices is not None
-    reached = stage.reached_by(file.devices)
-    return _driven_rig(file, reached, stage, stage, stage, should_stop, on_close)
+    console, plate = ConsoleOperator(), file.devices.plate
+    person = PersonAtPlate(console, plate.mass_kg) if plate else None
+    return driven_rig(file, person or console, person, should_stop)
 
 
-def _driven_rig(
+def driven_rig(
     file: RigFile,
-    devices: DeviceSettings,
     operator: Operator,
     plate: Plate | None,
-    shown: Loopback | None,
     should_stop: ShouldStop,
+    simulation: Simulation | None = None,
+    open_frames: Callable[[], FrameCamera] | None = None,
     on_close: tuple[Callable[[], None], ...] = (),
 ) -> Rig:
     """Build a rig of drivers; if one fails, the others are closed again.
 
     Args:
-        shown: the simulated scene behind the fakes; None on a real rig.
+        simulation: the simulated scene behind the fakes; None on a real rig.
+        open_frames: open the frame camera on that scene.
+        on_close: called last when the rig is closed.
+
+    Raises:
+        RigError: a device is missing, or delivers other times than the rig file says.
     """
+    devices = file.devices
+    assert devices is not None
     assert devices.sync_box is not None
     with ExitStack() as undo:
         frames = events = None
         if "frames" in file.cameras:
-            frames = _frame_camera(file, devices, shown)
+            frames = open_frames() if open_frames else _frame_camera(file, devices)
             undo.callback(frames.close)
             _check_grade(file.timing.frames, frames, "timing.frames")
         if "events" in file.cameras:
@@ -245,7 +141,7 @@ def _driven_rig(
         arm = devices.arm_driver.build(settings)
         further = []
         for name, stream in file.streams.items():
-            further.append(_driven_stream(name, stream, shown, arm, taught_frame(file)))
+            further.append(driven_stream(name, stream, arm, taught_frame(file)))
             undo.callback(further[-1].close)
         rig = Rig(
             name=file.name,
@@ -267,7 +163,7 @@ def _driven_rig(
             further=tuple(further),
             gripper=_gripper(devices),
             grip_opening_mm=file.grip_opening_mm or 0.0,
-            simulation=shown,
+            simulation=simulation,
             should_stop=should_stop,
             on_close=on_close,
         )
@@ -275,18 +171,12 @@ def _driven_rig(
     return rig
 
 
-def _frame_camera(file: RigFile, devices: DeviceSettings, shown: Loopback | None) -> FrameCamera:
-    driver, settings = devices.frame_camera_driver, devices.frame_camera
-    px_per_mm = file.frame_camera.scale_px_per_mm
-    if shown is None:
-        return driver.build(settings, px_per_mm)
-    assert driver.fake is not None  # the rig file was held against it
-    return driver.fake(settings, px_per_mm, shown, file.scene.frame_camera.exposure_us * 500)
+def _frame_camera(file: RigFile, devices: DeviceSettings) -> FrameCamera:
+    scale = file.frame_camera.scale_px_per_mm
+    return devices.frame_camera_driver.build(devices.frame_camera, scale)
 
 
-def _driven_stream(
-    name: str, stream: Stream, shown: Loopback | None, arm: Arm, plate: PlateFrame
-) -> FurtherStream:
+def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> DeviceStream:
     """Build a further device by its driver; the arm's controller may measure its forces.
 
     Raises:
@@ -295,8 +185,6 @@ def _driven_stream(
     driver, settings = stream.driver, stream.device
     device: Any = None
     if isinstance(driver, EventCameraDriver):
-        if shown is not None and settings is not None:
-            settings = shown.reached_stream(name, settings)
         device = driver.build(settings)
     elif isinstance(driver, FrameCameraDriver) and isinstance(stream, FrameStream):
         device = driver.build(settings, stream.scale_px_per_mm)
@@ -314,7 +202,7 @@ def _driven_stream(
     return made
 
 
-def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) -> FurtherStream:
+def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) -> DeviceStream:
     """Return a further device of a rig with what a trial's record says of its stream.
 
     Args:
@@ -327,14 +215,14 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
     stated: dict[str, Any] = {"kind": stream.kind, "rows": 0, "timing": stream.timing}
     if isinstance(stream, EventStream):
         stated["size_px"] = (device.width, device.height)
-        return FurtherEvents(name, device, StreamRecord(**stated))
+        return DeviceStream(name, device, StreamRecord(**stated))
     if isinstance(stream, FrameStream):
         device.set_region(*stream.region_px)
         stated["size_px"], stated["px_per_mm"] = stream.region_px, stream.scale_px_per_mm
         stated["mid_exposure_ns"] = device.mid_exposure_ns
         if stream.rate_hz is not None:
             stated["rate_hz"] = stream.rate_hz
-        return FurtherFrames(name, device, StreamRecord(**stated))
+        return DeviceStream(name, device, StreamRecord(**stated))
     if isinstance(stream, ForceStream):
         if device.grade != stream.timing.grade:
             text = (
@@ -343,11 +231,11 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
             )
             raise RigError(f"{name} (force sensor)", text)
         matrix = plate.force_matrix(device.mounting)
-        return FurtherForces(name, device, StreamRecord(**stated, to_plate=matrix))
+        return DeviceStream(name, device, StreamRecord(**stated, to_plate=matrix))
     if device.unit != stream.unit:
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)
-    return FurtherScalars(name, device, StreamRecord(**stated, unit=stream.unit))
+    return DeviceStream(name, device, StreamRecord(**stated, unit=stream.unit))
 
 
 def plate_limits(file: RigFile) -> PlateLimits:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from sliplab.protocols.later import need
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import Stream, named_drivers
 from sliplab.storage.streams import FRAMES_KIND

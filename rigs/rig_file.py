@@ -14,9 +14,8 @@ from pydantic import Field, field_validator
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
-from sliplab.protocols.nuisances import FlickerNuisance
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.program import Move, Twist
+from sliplab.protocols.program import Move
 from sliplab.protocols.quantity import (
     PositiveMillimetres,
     PositiveNewtons,
@@ -36,26 +35,23 @@ from sliplab.protocols.yaml_file import (
 )
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
-from sliplab.rigs.core.driver import Driver, EventCameraDriver
+from sliplab.rigs.core.driver import Driver, RigDriver
 from sliplab.rigs.core.gripper_range import GripperRange
-from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.mock.fault_kinds import StreamGone
-from sliplab.rigs.mock.settings import MockSettings, check_timing
+from sliplab.rigs.core.registry import find_driver
+from sliplab.rigs.core.sections import RigSection, SimulatedRig
+from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
-    check_distinct,
+    keyed_drivers,
     named_drivers,
-    stream_drivers,
     stream_faults,
 )
 from sliplab.rigs.twin import TwinRecord
 
 CAMERAS = {"events": "event camera", "frames": "frame camera"}
 """Streams by name in rig files and protocols, and the devices that give them."""
-SCALE_ERROR = 0.005
-"""Largest relative error of a measured scale."""
 
 
 class RigLimits(StrictModel):
@@ -165,7 +161,7 @@ class RigFile(StrictModel):
     """Signals that reach each device, and the quality of their clocks."""
     devices: DeviceSettings | None = None
     """Drivers of the devices; not for `mock`."""
-    mock: MockSettings | None = None
+    mock: Annotated[SimulatedRig, Simulated()] | None = None
     """The simulated scene and devices; not for `devices`."""
     streams: Streams = Field(default={})
     """Further devices, each under the name of its stream: a second event camera, a thermometer."""
@@ -184,20 +180,14 @@ class RigFile(StrictModel):
 
     @rule
     def _has_its_sections(self) -> Iterator[KeyedError]:
-        wanted = {
-            "mock": self.driver != "devices",
-            "devices": self.driver != "mock",
-        }
-        for name, needed in wanted.items():
-            found = getattr(self, name)
+        for name in ("mock", "devices"):
+            found, needed = getattr(self, name), name in self.sections
             if needed and found is None:
                 yield KeyedError(name, None, f"is needed by driver: {self.driver}")
             if not needed and found is not None:
                 yield KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
         if self.twin is not None and self.mock is None:
             yield KeyedError("twin", "...", f"has no meaning with driver: {self.driver}")
-        if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
-            yield KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
         if self.devices is not None:
             for name, words in CAMERAS.items():
                 key = words.replace(" ", "_")
@@ -210,63 +200,16 @@ class RigFile(StrictModel):
 
     @rule
     def _streams_are_complete(self) -> Iterator[KeyedError]:
-        yield from stream_faults(
-            self.streams, self.driver, None if self.mock is None else self.mock.clocks
-        )
-        if self.driver == "devices":
-            check_distinct(self.devices, self.streams)
-        for index, fault in enumerate(() if self.mock is None else self.mock.faults):
-            if isinstance(fault, StreamGone) and fault.stream not in self.streams:
-                known = ", ".join(self.streams) or "none"
-                text = f"is no further device of the rig; it has: {known}"
-                yield KeyedError(f"mock.faults[{index}].stream", fault.stream, text)
+        yield from stream_faults(self.streams, self.driver, self.sections)
 
     @rule
-    def _loopback_can_show_it(self) -> Iterator[KeyedError]:
-        if self.driver != "loopback" or self.mock is None or self.devices is None:
-            return
-        if set(self.cameras) != set(CAMERAS):
-            text = "must hold events and frames: a loopback rig has both cameras"
-            yield KeyedError("cameras", list(self.cameras), text)
-        assert self.devices.frame_camera is not None
-        exposure_us = self.mock.frame_camera.exposure_us
-        for key, value, right in (
-            (
-                "devices.frame_camera.exposure_us",
-                self.devices.frame_camera.exposure_us,
-                exposure_us,
-            ),
-            ("timing.frames", self.timing.frames, self.devices.frame_camera_driver.grade),
-            ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
-        ):
-            if value != right:
-                yield KeyedError(key, value, f"must be {right}, which is what the fakes simulate")
-        fakes: dict[str, Any] = {
-            "arm": self.devices.arm_driver.fake,
-            "event_camera": self.devices.event_camera_driver.reach,
-            "frame_camera": self.devices.frame_camera_driver.fake,
-            "sync_box": self.devices.sync_box_driver.fake,
-        }
-        if (sensor := self.devices.force_sensor_driver) is not None:
-            fakes["force_sensor"] = sensor.of_arm or sensor.fake
-            if self.mock.force is None:
-                text = "is needed: it is what the fake of devices.force_sensor shows"
-                yield KeyedError("mock.force", None, text)
-        if (gripper := self.devices.gripper_driver) is not None:
-            fakes["gripper"] = gripper.fake
-            fingers, opening = self.mock.gripper, self.grip_opening_mm
-            found = None if fingers is None else fingers.opening_mm
-            if found != opening:
-                text = f"must be {opening:g}: the fake of devices.gripper moves these fingers"
-                yield KeyedError("mock.gripper.opening_mm", found, text)
-        text = "has no fake for a loopback rig: write driver: devices"
-        for name, fake in fakes.items():
-            if fake is None:
-                found = getattr(self.devices, name).driver
-                yield KeyedError(f"devices.{name}.driver", found, text)
-        for name, driver, _ in stream_drivers(self.streams):
-            if not isinstance(driver, EventCameraDriver) or driver.reach is None:
-                yield KeyedError(f"streams.{name}.device.driver", driver.name, text)
+    def _driver_can_run_it(self) -> Iterator[KeyedError]:
+        yield from find_driver(self.driver, RigDriver).faults(self)
+
+    @rule
+    def _mock_agrees(self) -> Iterator[KeyedError]:
+        if self.mock is not None:
+            yield from self.mock.rig_faults(self)
 
     @rule
     def _limited_force_is_measured(self) -> Iterator[KeyedError]:
@@ -294,7 +237,7 @@ class RigFile(StrictModel):
             if not low <= wanted.force <= high:
                 text = f"must be from {low:g} to {high:g} N, which the gripper can be set to"
                 yield KeyedError("reflex.force", f"{wanted.force} N", text)
-        block_ms = 0 if self.mock is None else self.mock.event_camera.block_ms
+        block_ms = 0 if self.mock is None else self.mock.block_ms
         if wanted.stream_timeout * 1000 <= block_ms:
             text = f"must be over {block_ms} ms, the camera's blocks"
             yield KeyedError("reflex.stream_timeout", f"{wanted.stream_timeout} s", text)
@@ -305,53 +248,34 @@ class RigFile(StrictModel):
             yield KeyedError("poll", self.poll, "must be at most 1 s: a stop waits that long")
 
     @rule
-    def _scales_agree(self) -> Iterator[KeyedError]:
-        """Check that the simulated camera renders at the scale that the rig file states."""
-        if self.mock is None:
-            return
-        stated, rendered = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
-        if abs(stated - rendered) > SCALE_ERROR * rendered:
-            yield KeyedError(
-                "frame_camera.scale_px_per_mm",
-                stated,
-                f"must be mock.frame_camera.px_per_mm = {rendered:g}",
-            )
-
-    @rule
-    def _rates_agree(self) -> Iterator[KeyedError]:
-        """Check the stated rate of a camera that runs by itself."""
-        stated = self.frame_camera.rate_hz
-        if stated is None:
-            return
-        key = "frame_camera.rate_hz"
-        if self.timing.frames == "hardware trigger":
+    def _rate_of_its_own(self) -> Iterator[KeyedError]:
+        if self.frame_camera.rate_hz is not None and self.timing.frames == "hardware trigger":
             text = "must be left out with timing.frames: hardware trigger, the sync box's ticks"
-            yield KeyedError(key, stated, text)
-        if self.mock is not None and self.mock.frame_camera.rate_hz != stated:
-            text = f"must be mock.frame_camera.rate_hz = {self.mock.frame_camera.rate_hz:g}"
-            yield KeyedError(key, stated, text)
+            yield KeyedError("frame_camera.rate_hz", self.frame_camera.rate_hz, text)
 
-    @rule
-    def _clocks_meet_timing(self) -> RigFile:
-        """Check that the simulated clocks are no worse than `timing` states."""
-        if self.mock is not None:
-            sensor = None if self.devices is None else self.devices.force_sensor_driver
-            check_timing(self.mock, self.timing, sensor is not None and sensor.of_arm)
-        return self
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """Sections that the rig's driver needs; the first one has the devices that are driven."""
+        return find_driver(self.driver, RigDriver).sections
 
     @property
     def simulated(self) -> bool:
         """True if all data of this rig are simulated."""
-        return self.driver != "devices"
+        return "mock" in self.sections
 
     @property
     def in_virtual_time(self) -> bool:
         """True if the rig runs in virtual time, not in real time."""
-        return self.driver == "mock"
+        return "devices" not in self.sections
 
     @property
-    def scene(self) -> MockSettings:
-        """The simulated scene and devices.
+    def _driven(self) -> RigSection | None:
+        section: RigSection | None = getattr(self, self.sections[0])
+        return section
+
+    @property
+    def scene(self) -> Any:
+        """The simulated scene and devices, by the model that the driver `mock` declares.
 
         Raises:
             ValueError: a real rig has none.
@@ -368,27 +292,17 @@ class RigFile(StrictModel):
     @property
     def has_force(self) -> bool:
         """True if there is a force sensor."""
-        if self.driver == "mock":
-            return self.scene.force is not None
-        return self.devices is not None and self.devices.force_sensor is not None
+        return self._driven is not None and self._driven.has_force
 
     @property
     def gripper_range(self) -> GripperRange | None:
         """Values that the gripper's commands may have; None without a gripper."""
-        if self.driver == "mock":
-            made = self.scene.gripper
-            if made is None:
-                return None
-            return GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
-        if self.devices is None or (driver := self.devices.gripper_driver) is None:
-            return None
-        return driver.range(self.devices.gripper)
+        return None if self._driven is None else self._driven.gripper_range
 
     @property
     def grip_opening_mm(self) -> float | None:
         """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        named = self.scene if self.driver == "mock" else self.devices
-        return None if named is None or named.gripper is None else named.gripper.opening_mm
+        return None if self._driven is None else self._driven.grip_opening_mm
 
     def drivers(self) -> Iterator[tuple[str, Driver[Any], Any]]:
         """Return the part in the rig, driver and settings of every device, the arm first."""
@@ -397,7 +311,7 @@ class RigFile(StrictModel):
     @property
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
-        return self.mock.frame_camera.level if self.mock is not None else "video"
+        return "video" if self.mock is None else self.mock.frame_source
 
     def frame_bytes(self, with_plate: bool) -> float:
         """Return the expected size of one frame on disk, with or without the plate's marker."""
@@ -457,12 +371,7 @@ def _check(rig: RigFile) -> None:
 def _masked_secrets(rig: RigFile) -> Iterator[KeyedError]:
     if rig.simulated or rig.devices is None:
         return
-    further = [(f"streams.{name}.device", *found) for name, *found in stream_drivers(rig.streams)]
-    first = [
-        (f"devices.{driver.kind.replace(' ', '_')}", driver, settings)
-        for driver, settings in rig.devices.drivers()
-    ]
-    for where, driver, settings in (*first, *further):
+    for where, driver, settings in keyed_drivers(rig.devices, rig.streams):
         for name in driver.settings.model_fields:
             if is_secret(name) and getattr(settings, name) == MASK:
                 key = f"{where}.{name}"
@@ -605,8 +514,8 @@ def _plan_faults(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
     yield from _check_cameras(rig, plan)
     yield from _check_exposure(rig, plan, file)
     yield from _check_force(rig, plan)
-    yield from _check_twist(rig, plan, file)
-    yield from _check_flicker(rig, plan, file)
+    for name in rig.sections:
+        yield from getattr(rig, name).plan_faults(plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")
@@ -645,36 +554,3 @@ def _extents(plan: Plan) -> Iterator[tuple[str, float, tuple[str, str]]]:
         who = plan.file, "in collection.maintenance.rezero"
         yield "depth", float(upkeep.rezero.search), who
         yield "speed", float(upkeep.rezero.speed), who
-
-
-def _check_twist(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
-    """Check that the arm can twist, if the plan does."""
-    if rig.devices is None or rig.devices.arm_driver.twists:
-        return
-    for trial in plan:
-        if any(isinstance(step, Twist) for step in plan.program(trial).steps):
-            driver = rig.devices.arm_driver
-            yield InputError(
-                file,
-                "devices.arm.driver",
-                driver.name,
-                f"cannot turn the tool evenly on the spot, and trial {trial.id} of {plan.file} "
-                "does; use another driver, such as 'abb'",
-            )
-            return
-
-
-def _check_flicker(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
-    """Check that simulated pixels can see a flickering light, if the plan has one."""
-    if not rig.simulated or rig.scene.event_camera.cutoff_hz == 0:
-        return
-    for trial in plan:
-        if any(isinstance(each, FlickerNuisance) for each in plan.program(trial).nuisances):
-            yield InputError(
-                file,
-                "mock.event_camera.cutoff_hz",
-                rig.scene.event_camera.cutoff_hz,
-                f"must be 0 for the flicker of trial {trial.id} of {plan.file}: behind a low pass "
-                "it is not computed",
-            )
-            return

@@ -10,9 +10,8 @@ The first event camera and the first frame camera stay in `devices:` and `mock:`
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, Union
 
 from pydantic import (
@@ -38,14 +37,8 @@ from sliplab.rigs.core.driver import (
     ScalarSensorDriver,
 )
 from sliplab.rigs.core.registry import find_driver
-from sliplab.rigs.devices.settings import DeviceSettings, OfKind
-from sliplab.rigs.mock.further_settings import (
-    Further,
-    FurtherEventCamera,
-    FurtherFrameCamera,
-    Thermometer,
-)
-from sliplab.rigs.mock.settings import ClockErrors, MockForceSensorSettings
+from sliplab.rigs.core.sections import SimulatedStream
+from sliplab.rigs.device_section import DeviceSettings, OfKind, Simulated
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 RESERVED = frozenset(
@@ -62,8 +55,6 @@ RESERVED = frozenset(
     }
 )
 """Names of the first devices, in files, records and columns."""
-_PLACES = frozenset({"serial", "host", "port", "events_port", "triggers_port", "index", "path"})
-"""Keys by which drivers distinguish their devices."""
 MOST = 16
 """Further devices of a rig: a limit for people's typing errors, not of the store."""
 
@@ -98,31 +89,10 @@ class _StreamSettings(StrictModel):
         return self
 
     @rule
-    def _mock_keeps_its_promises(self) -> Self:
-        """Check that the simulated clock and delays are no worse than `timing` states."""
-        mock: Further | None = getattr(self, "mock", None)
-        if mock is None:
-            return self
-        timing, ppm = self.timing, getattr(mock, "clock_ppm", 0.0)
-        if ppm > timing.drift_ppm:
-            text = f"must be at most timing.drift_ppm = {timing.drift_ppm:g}"
-            raise KeyedError(".mock.clock_ppm", ppm, text)
-        if timing.grade == "arm clock":
-            text = "must be host time: the simulated sensor has its own clock"
-            raise KeyedError(".timing.grade", timing.grade, text)
-        by_delay = timing.grade in {"host arrival", "host time"}
-        if by_delay and not isinstance(mock, FurtherEventCamera):
-            shortest, longest = timing.delay.shortest_us, timing.delay.longest_us
-            if mock.latency_us < shortest:
-                text = f"must be at least timing.delay.shortest_us = {shortest:g}"
-                raise KeyedError(".mock.latency_us", mock.latency_us, text)
-            if mock.latency_us + mock.arrival_jitter_us > longest:
-                text = (
-                    f"must be at most {longest - mock.latency_us:g}: with latency_us, "
-                    f"timing.delay.longest_us = {longest:g}"
-                )
-                raise KeyedError(".mock.arrival_jitter_us", mock.arrival_jitter_us, text)
-        return self
+    def _mock_agrees(self) -> Iterator[KeyedError]:
+        mock: SimulatedStream | None = getattr(self, "mock", None)
+        if mock is not None:
+            yield from mock.stream_faults(self)
 
     @property
     def driver(self) -> Driver[Any] | None:
@@ -140,7 +110,7 @@ class EventStream(_StreamSettings):
     kind: Literal["events"]
     device: Annotated[DriverSettings, OfKind(EventCameraDriver, "dvxplorer")] | None = None
     """Its driver; not for `mock`."""
-    mock: FurtherEventCamera | None = None
+    mock: Annotated[SimulatedStream, Simulated("events")] | None = None
     """The simulated camera; not for `devices`."""
 
 
@@ -158,7 +128,7 @@ class FrameStream(_StreamSettings):
     """Frames a second of a camera that runs by itself, for counting losses; a triggered one has the
     protocol's `sync_rate`."""
     device: Annotated[FrameCameraSettings, OfKind(FrameCameraDriver, "basler")] | None = None
-    mock: FurtherFrameCamera | None = None
+    mock: Annotated[SimulatedStream, Simulated("frames")] | None = None
 
     @rule
     def _rate_of_its_own(self) -> Self:
@@ -168,22 +138,6 @@ class FrameStream(_StreamSettings):
             raise KeyedError(".rate_hz", None, text)
         if not by_itself and self.rate_hz is not None:
             text = "has no meaning with timing.grade: hardware trigger"
-            raise KeyedError(".rate_hz", self.rate_hz, text)
-        return self
-
-    @rule
-    def _mock_meets_it(self) -> Self:
-        if self.mock is None:
-            return self
-        for side, px in zip(("width", "height"), self.region_px, strict=True):
-            if px > getattr(self.mock, side):
-                text = f"exceeds mock.{side} = {getattr(self.mock, side)}"
-                raise KeyedError(".region_px", list(self.region_px), text)
-        if self.scale_px_per_mm != self.mock.px_per_mm:
-            text = f"must be mock.px_per_mm = {self.mock.px_per_mm:g}"
-            raise KeyedError(".scale_px_per_mm", self.scale_px_per_mm, text)
-        if self.rate_hz is not None and self.rate_hz != self.mock.rate_hz:
-            text = f"must be mock.rate_hz = {self.mock.rate_hz:g}"
             raise KeyedError(".rate_hz", self.rate_hz, text)
         return self
 
@@ -198,7 +152,7 @@ class ScalarStream(_StreamSettings):
     unit: str = Field(min_length=1, max_length=20)
     """Unit of the readings, such as `degC`."""
     device: Annotated[DriverSettings, OfKind(ScalarSensorDriver)] | None = None
-    mock: Thermometer | None = None
+    mock: Annotated[SimulatedStream, Simulated("scalar")] | None = None
 
     @field_validator("unit")
     @classmethod
@@ -217,7 +171,7 @@ class ForceStream(_StreamSettings):
 
     kind: Literal["wrench"]
     device: Annotated[DriverSettings, OfKind(ForceSensorDriver)] | None = None
-    mock: MockForceSensorSettings | None = None
+    mock: Annotated[SimulatedStream, Simulated("wrench")] | None = None
     """The simulated sensor, which feels the same load as the first one."""
 
 
@@ -233,17 +187,13 @@ KINDS: dict[str, type[Stream]] = {
 class _ByKind(ChosenModel):
     """A further device; `kind` selects the model of the other keys."""
 
-    def read(self, value: Any) -> Stream:
-        """Return the settings in `value`, checked by the model of their kind."""
-        if isinstance(value, _StreamSettings):
-            return value  # type: ignore[return-value]
-        if not isinstance(value, dict):
-            raise ValueError("must be a mapping (key: value)")
+    def choose(self, value: dict[str, Any]) -> type[Stream]:
+        """Return the model of the kind that `value` names."""
         kind = value.get("kind")
         if not isinstance(kind, str) or kind not in KINDS:
             hint = did_you_mean(str(kind), KINDS) if kind is not None else ""
             raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}{hint}")
-        return self.checked(KINDS[kind], value)
+        return KINDS[kind]
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
@@ -257,12 +207,12 @@ Streams = Annotated[dict[str, Annotated[Stream, _ByKind()]], Field(max_length=MO
 
 
 def stream_faults(
-    streams: Mapping[str, Stream], rig_driver: str, clocks: ClockErrors | None = None
+    streams: Mapping[str, Stream], rig_driver: str, sections: Collection[str]
 ) -> Iterator[KeyedError]:
     """Return what is wrong with names, and what each device lacks that the rig's driver needs.
 
     Args:
-        clocks: of a simulated rig.
+        sections: of such a rig's file: `devices`, `mock`.
     """
     for name, stream in streams.items():
         key = f"streams.{name}"
@@ -270,54 +220,13 @@ def stream_faults(
             yield KeyedError(key, name, f"a stream's name must match {NAME.pattern}")
         if name in RESERVED:
             yield KeyedError(key, name, "is the name of one of a rig's first devices")
-        for part, needed in (("mock", rig_driver != "devices"), ("device", rig_driver != "mock")):
+        for part, needed in (("mock", "mock" in sections), ("device", "devices" in sections)):
             found = getattr(stream, part)
             if needed and found is None:
                 yield KeyedError(f"{key}.{part}", None, f"is needed by driver: {rig_driver}")
             if not needed and found is not None:
                 text = f"has no meaning with driver: {rig_driver}"
                 yield KeyedError(f"{key}.{part}", "...", text)
-        jitter = {"events": "pulse_jitter_us", "frames": "frame_jitter_us"}.get(stream.kind)
-        if clocks is None or jitter is None or stream.timing.grade == "host arrival":
-            continue
-        promised = stream.timing.jitter_us
-        if getattr(clocks, jitter) > promised:
-            text = f"must be at most {key}.timing.jitter_us = {promised:g}"
-            yield KeyedError(f"mock.clocks.{jitter}", getattr(clocks, jitter), text)
-
-
-def check_distinct(devices: DeviceSettings | None, streams: Mapping[str, Stream]) -> None:
-    """Check that no two devices of one driver are the same one.
-
-    Raises:
-        KeyedError: two have the same serial number, address or port, or both leave it out.
-    """
-    known: dict[tuple[str, str], str] = {}
-    first = [] if devices is None else list(devices.drivers())
-    named = [(f"devices.{driver.kind.replace(' ', '_')}", driver, used) for driver, used in first]
-    named += [
-        (f"streams.{name}.device", driver, used) for name, driver, used in stream_drivers(streams)
-    ]
-    for key, driver, settings in named:
-        place = _place(settings.model_dump(mode="json"))
-        if not place:
-            continue
-        found = driver.name, json.dumps(place, sort_keys=True)
-        if found in known and key.startswith("streams."):
-            text = f"is the same device as {known[found]}: say which by {', '.join(place)}"
-            raise KeyedError(key, driver.name, text)
-        known[found] = key
-
-
-def _place(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return the settings that distinguish devices of one driver, by key."""
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            found |= _place(value, f"{before}{key}.")
-        elif key in _PLACES:
-            found[f"{before}{key}"] = value
-    return found
 
 
 def stream_drivers(streams: Mapping[str, Stream]) -> Iterator[tuple[str, Driver[Any], Any]]:
@@ -339,12 +248,11 @@ def named_drivers(
         yield f"{name} ({driver.kind})", driver, settings
 
 
-def simulated_streams(
-    streams: Mapping[str, Stream],
-) -> dict[str, tuple[Further, StreamTiming, str]]:
-    """Return settings, timing and unit of every simulated further device, by its name."""
-    return {
-        name: (stream.mock, stream.timing, getattr(stream, "unit", ""))
-        for name, stream in streams.items()
-        if stream.mock is not None
-    }
+def keyed_drivers(
+    devices: DeviceSettings | None, streams: Mapping[str, Stream]
+) -> Iterator[tuple[str, Driver[Any], Any]]:
+    """Yield the key in the rig file, driver and settings of every device, the arm first."""
+    for driver, settings in () if devices is None else devices.drivers():
+        yield f"devices.{driver.kind.replace(' ', '_')}", driver, settings
+    for name, driver, settings in stream_drivers(streams):
+        yield f"streams.{name}.device", driver, settings

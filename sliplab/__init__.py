@@ -36,10 +36,14 @@ if TYPE_CHECKING:
         Store,
         Trial,
         WindowCounts,
+        check,
         collect,
+        export,
+        import_data,
         load_model,
         open_store,
         plan,
+        verify,
     )
     from sliplab.flows.collecting.requests import CampaignStopped
     from sliplab.protocols.errors import InputError
@@ -60,10 +64,14 @@ __all__ = [
     "Trial",
     "WindowCounts",
     "__version__",
+    "check",
     "collect",
+    "export",
+    "import_data",
     "load_model",
     "open_store",
     "plan",
+    "verify",
 ]
 __version__: str
 

@@ -16,6 +16,8 @@ MOVED = {
     "sliplab.flows.ui.review_page": "sliplab.flows.ui.review_tab",
     "sliplab.rigs.mock.faults": "sliplab.rigs.mock.fault_book",
     "sliplab.rigs.mock.fault_settings": "sliplab.rigs.mock.fault_kinds",
+    "sliplab.rigs.devices.settings": "sliplab.rigs.device_section",
+    "sliplab.rigs.levels": "sliplab.rigs.mock.levels",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }
 """Old names of packages and modules, and what they are now."""

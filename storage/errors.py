@@ -55,6 +55,17 @@ class NoStore(InputError, StoreError):
         return type(self), (str(self.file), self.expected)
 
 
+class NoTrial(InputError, StoreError):
+    """A trial was named that a store lacks, or that several of its campaigns have: wrong input."""
+
+    def __init__(self, trial: str, why: str) -> None:
+        super().__init__("TRIAL", "", trial, why)
+
+    def __reduce__(self) -> tuple[type[NoTrial], tuple[str, ...]]:
+        """Pickle its own arguments, as `NoStore` does."""
+        return type(self), (str(self.value), self.expected)
+
+
 def disk_fault(error: BaseException | None) -> str | None:
     """Return the fault of the disk that `error` or its cause states, such as ``is full``.
 

@@ -1,4 +1,4 @@
-"""Chunks of device streams: plain arrays with raw device times.
+"""Chunks of device streams, and the kinds of stream: plain arrays with raw device times.
 
 A chunk is the unit that flows from a device through the rig into the recording being written.
 Nothing here converts a time: raw device times are stored unchanged, and clock maps are added
@@ -7,9 +7,9 @@ later (docs/decisions/time.md). All times are int64.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +21,169 @@ U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 
 
+class Column(NamedTuple):
+    """A column of a stored stream."""
+
+    field: str
+    """The field of the stream's chunks."""
+    dtype: str
+    shape: tuple[int, ...]
+    """Of one row; -1 for a length that the first row decides."""
+    unit: str
+
+
 @dataclass(frozen=True)
-class EventChunk:
+class StreamKind:
+    """A kind of stream. A package adds one: a constant, and a subclass of `Chunk` that has it.
+
+    Attributes:
+        name: as it is stored.
+        columns: by their stored names; ``t`` has the time of each row, and ``host``, if it is
+            there, the host's time of reception.
+        indexed: rows are found by their time, through an index.
+        camera: ``events`` or ``frames``, the first camera in whose groups it is, where a camera
+            sends it: a further camera has a file with the same groups.
+    """
+
+    name: str
+    columns: Mapping[str, Column]
+    indexed: bool = False
+    camera: str = ""
+
+    def timed_by(self, unit: str) -> StreamKind:
+        """Return the same kind with another unit of its times."""
+        times = self.columns["t"]._replace(unit=unit)
+        return replace(self, columns={**self.columns, "t": times})
+
+
+_HOST = Column("host_ns", "int64", (), "ns of the host's monotonic clock")
+EVENTS = StreamKind(
+    "events",
+    {
+        "x": Column("x", "uint16", (), "px"),
+        "y": Column("y", "uint16", (), "px"),
+        "p": Column("p", "uint8", (), "1 brighter, 0 darker"),
+        "t": Column("t_us", "int64", (), "us of the event camera's clock after t_offset"),
+    },
+    indexed=True,
+    camera="events",
+)
+FRAMES = StreamKind(
+    "frames",
+    {
+        "number": Column("number", "int64", (), "the camera's frame counter"),
+        "t": Column("t_ns", "int64", (), "ns of the frame camera's clock, middle of exposure"),
+        "host": _HOST,
+        "sync": Column("sync", "uint8", (), "level of the sync line during exposure"),
+    },
+    camera="frames",
+)
+POSES = StreamKind(
+    "poses",
+    {
+        "t": Column("t_ns", "int64", (), "ns of the arm controller's clock"),
+        "host": _HOST,
+        "xyz": Column("xyz_mm", "float64", (3,), "mm in the arm's base frame"),
+        "rotvec": Column("rotvec_deg", "float64", (3,), "degrees, rotation vector"),
+    },
+)
+PULSES = StreamKind(
+    "pulses", {"t": Column("t_ns", "int64", (), "ns of the device's clock")}, camera="events"
+)
+EXPOSURES = replace(PULSES, name="exposures")
+READS = StreamKind(
+    "reads",
+    {
+        "t": Column("device_ns", "int64", (), "ns of the device's clock"),
+        "before": Column("before_ns", "int64", (), "ns of the host's monotonic clock"),
+        "after": Column("after_ns", "int64", (), "ns of the host's monotonic clock"),
+    },
+    camera="frames",
+)
+TRIGGERS = StreamKind(
+    "triggers",
+    {
+        "t": Column("t_ns", "int64", (), "ns of the event camera's clock"),
+        "kind": Column("kind", "uint8", (), "what the event camera noted, as AEDAT4 numbers it"),
+    },
+    camera="events",
+)
+WRENCH = StreamKind(
+    "wrench",
+    {
+        "t": Column("t_ns", "int64", (), "ns of the sensor's clock"),
+        "host": _HOST,
+        "force": Column("force_n", "float64", (3,), "N along the sensor's axes"),
+        "torque": Column("torque_nm", "float64", (3,), "N m about the sensor's axes"),
+    },
+)
+SCALAR = StreamKind(
+    "scalar",
+    {
+        "t": Column("t_ns", "int64", (), "ns of the sensor's clock"),
+        "host": _HOST,
+        "value": Column("value", "float64", (), "the group's attribute `unit`"),
+    },
+)
+
+
+class Chunk:
+    """n rows of one stream in order; the first axis of each of its arrays counts the rows."""
+
+    KIND: ClassVar[StreamKind]
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def times(self) -> I64:
+        """The time of each row on the device's clock, in the unit that the kind says."""
+        times: I64 = getattr(self, self.KIND.columns["t"].field)
+        return times
+
+    def __getitem__(self, part: slice | npt.NDArray[Any]) -> Self:
+        """Return the rows of a slice, a mask, or an array of indices."""
+        return self._with({name: values[part] for name, values in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+    def _with(self, arrays: Mapping[str, npt.NDArray[Any]]) -> Self:
+        return type(self)(**{**vars(self), **arrays})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return chunks that follow each other in time as one; a single one is not copied."""
+        if len(parts) < 2:
+            return parts[0] if parts else cls.empty()
+        names = parts[0]._arrays()
+        return parts[0]._with({n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+
+    joined = concatenate
+    """The former name, which drivers of other packages use."""
+
+    @classmethod
+    def from_columns(cls, columns: Mapping[str, npt.NDArray[Any]], **more: Any) -> Self:
+        """Return a chunk of columns by their stored names.
+
+        Args:
+            more: fields of the chunk that are no columns.
+        """
+        known = cls.KIND.columns
+        return cls(**{known[part].field: values for part, values in columns.items()}, **more)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a chunk without rows."""
+        columns = cls.KIND.columns
+        return cls.from_columns({k: np.empty((0, *c.shape), c.dtype) for k, c in columns.items()})
+
+
+@dataclass(frozen=True)
+class EventChunk(Chunk):
     """Events in time order, each array of shape (n,)."""
+
+    KIND = EVENTS
 
     x: U16
     """Column, pixels from the left."""
@@ -34,40 +194,41 @@ class EventChunk:
     t_us: I64
     """Camera clock, microseconds, never decreasing."""
 
-    def __len__(self) -> int:
-        return len(self.t_us)
-
-    @staticmethod
-    def empty() -> EventChunk:
-        """Return a chunk without events."""
-        none = np.empty(0, np.uint16)
-        return EventChunk(none, none, np.empty(0, np.uint8), np.empty(0, np.int64))
-
-    @staticmethod
-    def joined(parts: Sequence[EventChunk]) -> EventChunk:
-        """Return chunks that follow each other in time as one; a single one is not copied."""
-        if len(parts) == 1:
-            return parts[0]
-        if not parts:
-            return EventChunk.empty()
-        names = ("x", "y", "p", "t_us")
-        return EventChunk(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
 
 @dataclass(frozen=True)
-class PulseChunk:
+class PulseChunk(Chunk):
     """Rising edges as one device saw them, of the sync line or of another one, shape (n,)."""
+
+    KIND = PULSES
 
     t_ns: I64
     """Clock of that device, nanoseconds (a microsecond counter times 1,000)."""
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
+
+@dataclass(frozen=True)
+class ExposureChunk(PulseChunk):
+    """Starts of a frame camera's exposures, as the sync box saw them, shape (n,)."""
+
+    KIND = EXPOSURES
 
 
 @dataclass(frozen=True)
-class ClockReads:
+class TriggerChunk(Chunk):
+    """Triggers that an event camera noted, of an imported trial, shape (n,)."""
+
+    KIND = TRIGGERS
+
+    t_ns: I64
+    """Clock of the camera, nanoseconds."""
+    kind: U8
+    """What it noted, as AEDAT4 numbers it."""
+
+
+@dataclass(frozen=True)
+class ClockReads(Chunk):
     """A device's clock, read by the host between a question and its answer, n times."""
+
+    KIND = READS
 
     device_ns: I64
     """Reading of the device's clock, nanoseconds, shape (n,)."""
@@ -76,13 +237,12 @@ class ClockReads:
     after_ns: I64
     """Host's monotonic clock when it had the answer, nanoseconds, shape (n,)."""
 
-    def __len__(self) -> int:
-        return len(self.device_ns)
-
 
 @dataclass(frozen=True)
-class PoseChunk:
+class PoseChunk(Chunk):
     """Arm poses as the controller reported them, n of them."""
+
+    KIND = POSES
 
     t_ns: I64
     """Controller clock, nanoseconds, shape (n,)."""
@@ -93,13 +253,12 @@ class PoseChunk:
     rotvec_deg: F64
     """Rotation vector, degrees, shape (n, 3)."""
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
 
 @dataclass(frozen=True)
-class FrameChunk:
+class FrameChunk(Chunk):
     """Frames of the outside camera in order, n of them: images, or the marker positions in them."""
+
+    KIND = FRAMES
 
     images: U8
     """Grey levels, shape (n, height, width); (n, 0, 0) from a camera that returns tracks."""
@@ -118,15 +277,19 @@ class FrameChunk:
     plate_px: F32 | None = None
     """Centre of the plate's marker, with `markers_px`, shape (n, 2); None without one."""
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a chunk without frames."""
+        none = np.empty(0, np.int64)
+        images = np.empty((0, 0, 0), np.uint8)
+        return cls(images, none, none, none, none.astype(np.uint8))
 
 
 @dataclass(frozen=True)
-class WrenchChunk:
-    """Forces and torques of one sensor in its own axes, n of them; a chunk of a named stream."""
+class WrenchChunk(Chunk):
+    """Forces and torques of one sensor in its own axes, n of them."""
 
-    KIND: ClassVar[str] = "wrench"
+    KIND = WRENCH
 
     t_ns: I64
     """Sensor's clock, nanoseconds, shape (n,)."""
@@ -137,21 +300,12 @@ class WrenchChunk:
     torque_nm: F64
     """Torque about the sensor's axes, newton metres, shape (n, 3)."""
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    @staticmethod
-    def empty() -> WrenchChunk:
-        """A chunk without rows."""
-        none = np.empty(0, np.int64)
-        return WrenchChunk(none, none, np.empty((0, 3)), np.empty((0, 3)))
-
 
 @dataclass(frozen=True)
-class ScalarChunk:
-    """Readings of one quantity, such as a temperature, n of them; a chunk of a named stream."""
+class ScalarChunk(Chunk):
+    """Readings of one quantity, such as a temperature, n of them."""
 
-    KIND: ClassVar[str] = "scalar"
+    KIND = SCALAR
 
     t_ns: I64
     """Sensor's clock, nanoseconds, shape (n,); `host_ns` again from a sensor without a clock."""
@@ -162,24 +316,29 @@ class ScalarChunk:
     unit: str = ""
     """Unit of the readings, such as ``degC``; the same over a whole stream."""
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    @staticmethod
-    def empty(unit: str = "") -> ScalarChunk:
+    @classmethod
+    def empty(cls, unit: str = "") -> Self:
         """Return a chunk without readings."""
-        none = np.empty(0, np.int64)
-        return ScalarChunk(none, none, np.empty(0), unit)
+        return replace(super().empty(), unit=unit)
 
 
-StreamChunk = WrenchChunk | ScalarChunk
-"""Chunks that a named stream in the trial's own file may be made of;
-`storage.trials.hdf5_writer.STREAMS` has the columns of each."""
-CameraChunk = EventChunk | FrameChunk | PulseChunk | ClockReads
-"""Chunks of a further camera, whose stream has its own file: its events or frames, the sync
-pulses that it saw, and reads of its clock."""
-EVENTS_KIND, FRAMES_KIND = "events", "frames"
-"""Kinds of the named streams of further cameras."""
+CHUNKS: dict[str, type[Chunk]] = {
+    chunk.KIND.name: chunk
+    for chunk in (
+        EventChunk,
+        FrameChunk,
+        PoseChunk,
+        PulseChunk,
+        ExposureChunk,
+        ClockReads,
+        TriggerChunk,
+        WrenchChunk,
+        ScalarChunk,
+    )
+}
+"""Types of the chunks of SlipLab's own kinds of stream, by the kind's name."""
+EVENTS_KIND, FRAMES_KIND = EVENTS.name, FRAMES.name
+"""Names of the first cameras' streams, and of the kinds of further cameras' ones."""
 
 
 @dataclass(frozen=True)
@@ -210,48 +369,20 @@ class PathSegment:
 class Sink(Protocol):
     """Receiver of a rig's streams; a trial being written is one."""
 
-    def add_events(self, chunk: EventChunk) -> None:
-        """Append events (time order over all calls)."""
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Append to the stream of a device that is of the chunk's kind, in time order.
 
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        """Append sync pulses seen by the event camera."""
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        """Append sync pulses seen by the arm's digital input."""
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        """Append the pulses that the sync box says it sent, on its own clock."""
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Append the starts of exposures that the sync box saw, on its own clock."""
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        """Append reads of the sync box's clock."""
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        """Append reads of the frame camera's clock."""
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Append arm poses."""
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Append frames."""
-
-    def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
-        """Append to the stream of this name, which keeps the kind of its first chunk."""
+        Args:
+            device: ``arm``, ``sync_box``, ``events`` and ``frames`` (the first cameras), or the
+                name of any other device that the rig has.
+        """
 
 
 class NullSink:
-    """A sink that drops every stream; a subclass takes some of them."""
+    """A sink that drops every chunk; a subclass takes some of them."""
 
-    def _drop(self, chunk: Any) -> None:
+    def add(self, device: str, chunk: Chunk) -> None:
         """Drop a chunk."""
-
-    add_events = add_event_pulses = add_arm_pulses = add_sync_pulses = _drop
-    add_exposures = add_box_reads = add_frame_camera_reads = add_poses = add_frames = _drop
-
-    def add_stream(self, name: str, chunk: Any) -> None:
-        """Drop a chunk of a named stream."""
 
 
 Json = dict[str, Any]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import copy
 import ctypes
+import functools
 import gc
 import os
 import shutil
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer.main
 import yaml
 from hypothesis import settings
 
@@ -22,9 +24,32 @@ ROOT = Path(__file__).parents[1]
 settings.register_profile("sliplab", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("sliplab")
 
+MEMORY, ROOM_GB = Path("/dev/shm"), 16
+
+
+def _write_in_memory() -> None:
+    """Keep what tests write in memory, where there is room: a disk must answer each fsync.
+
+    The workers of pytest-xdist inherit the folder, which goes with the process that made it. With
+    ``TMPDIR`` given it is there instead, and files of tests that failed stay.
+    """
+    if "TMPDIR" in os.environ or not MEMORY.is_dir():
+        return
+    if shutil.disk_usage(MEMORY).free < ROOM_GB * 2**30:
+        return
+    folder = tempfile.mkdtemp("", "", MEMORY)  # short: names of sockets have a limit
+    os.chmod(folder, 0o755)  # PostgreSQL runs as a user of its own
+    os.environ["TMPDIR"] = folder
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+
+_write_in_memory()
 # tests that run at the same time have stand-ins of their own, at the same addresses
 os.environ["SLIPLAB_RUNTIME"] = tempfile.mkdtemp(prefix="sliplab-rigs-")
 atexit.register(shutil.rmtree, os.environ["SLIPLAB_RUNTIME"], ignore_errors=True)
+
+# commands run in this process: their signatures are read once, not again for each command
+typer.main.get_params_from_function = functools.cache(typer.main.get_params_from_function)
 
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 

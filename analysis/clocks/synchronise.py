@@ -31,11 +31,19 @@ from sliplab.analysis.clocks.clocks import (
     fit_numbered,
 )
 from sliplab.protocols.shown import plural
-from sliplab.protocols.timing import Delay, DeviceClock, ForceTiming, StreamTiming, Timing
+from sliplab.protocols.timing import (
+    WIRED,
+    Delay,
+    DeviceClock,
+    ForceTiming,
+    StreamGrade,
+    StreamTiming,
+    Timing,
+)
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.trial import DeviceRecord, StreamRecord, TrialClockMaps
-from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, WrenchChunk
+from sliplab.storage.streams import EVENTS_KIND, WRENCH, ClockReads
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
@@ -48,34 +56,27 @@ VERSION = 6
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
 """A clock that falls back by more than this restarted or jumped."""
+_NONE: I64 = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
-class ClockReadings:
-    """A clock read by the host n times: between question and answer, ns; each (n,) int64."""
-
-    device_ns: I64
-    before_ns: I64
-    after_ns: I64
-
-
-@dataclass(frozen=True)
-class FurtherClock:
-    """Raw clock data of a further device, ns.
+class StreamClock:
+    """Raw clock data of a device with a stream, ns; empty where there are none.
 
     Attributes:
+        timing: how it is timed; None for the first force sensor, which the rig's timing times.
         pulses: sync pulses on the device's clock; of a frame camera the starts of the exposures
             during which the sync line was high.
         reads: the device's clock as the host read it.
-        samples: of a force sensor: its own and the host's time of each sample.
+        mid_exposure_ns: of a frame camera: from the start of an exposure to its middle.
+        samples: of a sensor: its own and the host's time of each sample.
     """
 
-    kind: str
-    timing: StreamTiming
-    pulses: I64
-    reads: ClockReadings
+    timing: StreamTiming | None
+    pulses: I64 = field(default_factory=lambda: _NONE)
+    reads: ClockReads = field(default_factory=ClockReads.empty)
     mid_exposure_ns: int = 0
-    samples: tuple[I64, I64] | None = None
+    samples: tuple[I64, I64] = _NONE, _NONE
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,7 @@ class SyncStreams:
         pose_ns, pose_host_ns: controller's and host's time of every pose.
         box_reads, frame_camera_reads: clocks read by the host.
         mid_exposure_ns: from the start of an exposure to its middle; None without frames.
-        wrenches: of every force sensor by its name: its own and the host's time of each sample.
-        further: of every other named stream.
+        named: of every named stream.
     """
 
     sync_pulses: I64
@@ -102,11 +102,10 @@ class SyncStreams:
     frame_sync: npt.NDArray[np.uint8]
     pose_ns: I64
     pose_host_ns: I64
-    box_reads: ClockReadings
-    frame_camera_reads: ClockReadings
+    box_reads: ClockReads
+    frame_camera_reads: ClockReads
     mid_exposure_ns: int | None
-    wrenches: dict[str, tuple[I64, I64]] = field(default_factory=dict)
-    further: dict[str, FurtherClock] = field(default_factory=dict)
+    named: dict[str, StreamClock] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -186,60 +185,69 @@ class TrialSync:
         return self.devices["events"].uncertainty_ns + self.devices[device].uncertainty_ns
 
 
-def further_clock(name: str, about: StreamRecord, reader: StreamReader) -> FurtherClock | None:
-    """Read the clock data of a further device; None of one that `timing.rig` times.
+def stream_clocks(
+    about: Mapping[str, StreamRecord], opened: Callable[[str | None], StreamReader]
+) -> dict[str, StreamClock]:
+    """Read the clock data of the named streams, but for those that `timing.rig` times.
 
     Args:
-        about: what the record says of its stream.
-        reader: the file that holds the stream: a camera's own, or the trial's.
+        about: what the record says of the streams.
+        opened: opens the file of a further camera by its name; the trial's own for None.
     """
-    if about.timing is None:
-        return None
-    none = np.empty(0, np.int64)
-    pulses, reads, samples = none, ClockReadings(none, none, none), None
-    if about.kind == EVENTS_KIND:
-        pulses = reader.column("event_pulses/t")
-    elif about.kind == WrenchChunk.KIND:
-        wrenches = reader.wrenches(name)
-        samples = wrenches.t_ns, wrenches.host_ns
-    elif about.kind == FRAMES_KIND:
-        lit = reader.column("frames/sync") > 0
-        pulses = reader.column("frames/t")[lit] - (about.mid_exposure_ns or 0)
-        found = reader.clock_reads("frame_camera_reads")
-        reads = ClockReadings(found.device_ns, found.before_ns, found.after_ns)
-    mid_ns = about.mid_exposure_ns or 0
-    return FurtherClock(about.kind, about.timing, pulses, reads, mid_ns, samples)
-
-
-def further_clocks(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, FurtherClock]:
-    """Read the clock data of the further devices of a sealed trial."""
-    found: dict[str, FurtherClock] = {}
+    found: dict[str, StreamClock] = {}
     for name, stream in about.items():
-        file = stream_file(name) if stream.of_camera else DATA
-        with StreamReader(folder / file) as reader:
-            clock = further_clock(name, stream, reader)
-        if clock is not None:
-            found[name] = clock
+        if stream.timing is not None:
+            with opened(name if stream.of_camera else None) as reader:
+                found[name] = _stream_clock(name, stream, reader)
     return found
+
+
+def _stream_clock(name: str, about: StreamRecord, reader: StreamReader) -> StreamClock:
+    if not about.of_camera:
+        return StreamClock(about.timing, samples=_samples(name, reader))
+    mid_ns = about.mid_exposure_ns or 0
+    if about.kind == EVENTS_KIND:
+        return StreamClock(about.timing, reader.pulses("event_pulses"))
+    lit = reader.column("frames/sync") > 0
+    begins = reader.column("frames/t")[lit] - mid_ns
+    return StreamClock(about.timing, begins, reader.clock_reads("frame_camera_reads"), mid_ns)
+
+
+def _samples(name: str, reader: StreamReader) -> tuple[I64, I64]:
+    """Return the sensor's and the host's time of each sample of a named stream."""
+    own, host = (f"{STREAM_GROUP}/{name}/{part}" for part in ("t", "host"))
+    if not reader.has(own):  # nothing came
+        return _NONE, _NONE
+    return reader.column(own), reader.column(host)
+
+
+def clocks_in(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, StreamClock]:
+    """Read the clock data of the named streams of a sealed trial; see `stream_clocks`."""
+    return stream_clocks(
+        about, lambda name: StreamReader(folder / (DATA if name is None else stream_file(name)))
+    )
 
 
 def streams_of(
     reader: StreamReader,
     mid_exposure_ns: int | None,
-    further: Mapping[str, FurtherClock] | None = None,
+    named: Mapping[str, StreamClock] | None = None,
 ) -> SyncStreams:
     """Read the clock data of a trial's file.
 
     Args:
-        further: clock data of its further devices, by name.
+        named: clock data of its named streams, as far as these have a timing of their own.
     """
 
     def column(name: str) -> I64:
-        return reader.column(name) if reader.has(name) else np.empty(0, np.int64)
+        return reader.column(name) if reader.has(name) else _NONE
 
-    def reads(group: str) -> ClockReadings:
-        return ClockReadings(*(column(f"{group}/{name}") for name in ("t", "before", "after")))
-
+    named = named or {}
+    first = {
+        name: StreamClock(None, samples=_samples(name, reader))
+        for name, kind in reader.streams().items()
+        if kind == WRENCH.name and name not in named
+    }
     return SyncStreams(
         sync_pulses=column("sync_pulses/t"),
         event_pulses=column("event_pulses/t"),
@@ -250,15 +258,10 @@ def streams_of(
         frame_sync=column("frames/sync").astype(np.uint8),
         pose_ns=column("poses/t"),
         pose_host_ns=column("poses/host"),
-        box_reads=reads("box_reads"),
-        frame_camera_reads=reads("frame_camera_reads"),
+        box_reads=reader.clock_reads("box_reads"),
+        frame_camera_reads=reader.clock_reads("frame_camera_reads"),
         mid_exposure_ns=mid_exposure_ns,
-        wrenches={
-            name: (column(f"{STREAM_GROUP}/{name}/t"), column(f"{STREAM_GROUP}/{name}/host"))
-            for name, kind in reader.streams().items()
-            if kind == WrenchChunk.KIND and name not in (further or {})
-        },
-        further=dict(further or {}),
+        named={**first, **named},
     )
 
 
@@ -271,14 +274,9 @@ def synchronise_recording(recording: Recording) -> TrialSync:
     timing = recording.record.timing
     if timing is None:
         raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
-    further: dict[str, FurtherClock] = {}
-    for name, about in recording.record.streams.items():
-        with recording.open(name if about.of_camera else None) as reader:
-            clock = further_clock(name, about, reader)
-        if clock is not None:
-            further[name] = clock
+    named = stream_clocks(recording.record.streams, recording.open)
     with recording.open() as reader:
-        streams = streams_of(reader, timing.mid_exposure_ns, further)
+        streams = streams_of(reader, timing.mid_exposure_ns, named)
     with_events = recording.record.geometry.event_px is not None
     return synchronise(streams, timing.rig, timing.rate_hz, with_events=with_events)
 
@@ -292,56 +290,53 @@ def synchronise(
         rate_hz: ticks of the box a second.
         with_events: an event camera was recorded.
     """
-    names = frozenset({*streams.wrenches, *streams.further})
-    found = TrialSync(timing.code, {}, {}, {}, names)
-    events, arm = timing.event_camera, timing.arm_controller
+    found = TrialSync(timing.code, {}, {}, {}, frozenset(streams.named))
     pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
     if with_events:
-        stamps = streams.event_pulses
-        _try(found, "events", lambda: pulses.fit("events", stamps, events, "trigger input"))
+        how = _timing(timing.event_camera, "trigger input")
+        camera = StreamClock(how, streams.event_pulses)
+        _try(found, "events", partial(_stream, pulses, "events", camera, streams))
     if timing.arm == "digital input":
-        _try(found, "arm", lambda: pulses.fit("arm", streams.arm_pulses, arm, timing.arm))
+        stamps, arm = streams.arm_pulses, timing.arm_controller
+        _try(found, "arm", lambda: pulses.fit("arm", stamps, arm, timing.arm))
     else:
         _try(found, "arm", lambda: _arm_by_host(streams, timing))
     if streams.mid_exposure_ns is not None:
-        _synchronise_frames(found, pulses, streams, streams.mid_exposure_ns)
-    how = timing.force or ForceTiming()
-    for name, samples in streams.wrenches.items():
-        _try(found, name, partial(_force, found, name, samples, how, streams, timing))
-    for name, device in streams.further.items():
-        _try(found, name, partial(_further, pulses, name, device, streams))
+        begins = streams.frame_ns - streams.mid_exposure_ns
+        if timing.frames == "exposure line":
+            _try(found, "frames", lambda: _by_exposures(begins, streams, timing))
+        else:
+            how = _timing(timing.frame_camera, timing.frames)
+            camera = StreamClock(
+                how.model_copy(update={"delay": timing.frame_delay}),
+                begins[streams.frame_sync > 0],
+                streams.frame_camera_reads,
+                streams.mid_exposure_ns,
+            )
+            _try(found, "frames", partial(_stream, pulses, "frames", camera, streams))
+    for name, clock in streams.named.items():
+        _try(found, name, partial(_stream, pulses, name, clock, streams))
     return found
 
 
-def _further(pulses: _Pulses, name: str, device: FurtherClock, streams: SyncStreams) -> DeviceSync:
-    """Fit the clock of a further device by the means of its grade."""
-    how, timing = device.timing, pulses.timing
-    if how.grade in {"trigger input", "hardware trigger"}:
+def _timing(clock: DeviceClock, grade: StreamGrade) -> StreamTiming:
+    """Return the timing of a first camera as that of any device with a stream."""
+    return StreamTiming(**clock.model_dump(), grade=grade)
+
+
+def _stream(pulses: _Pulses, name: str, device: StreamClock, streams: SyncStreams) -> DeviceSync:
+    """Fit the clock of a device with a stream by the means of its grade."""
+    timing = pulses.timing
+    how = device.timing or timing.force or ForceTiming()
+    if how.grade in WIRED:
         return pulses.fit(name, device.pulses, how, how.grade)
-    if device.samples is not None:
-        return _force(pulses.found, name, device.samples, how, streams, timing)
+    if how.grade == "arm clock" or how.grade == "host time":
+        return _by_samples(pulses.found, name, device.samples, how, streams, timing)
     if how.grade == "device time stamps":
         what = f"readings of the clock of {name}"
         bounded = _bounded(device.reads, how.drift_ppm + HOST_PPM, what)
         return _through_host(bounded, streams, timing, how.grade)
     return _by_arrival(how.delay, device.mid_exposure_ns, how.grade, streams, timing)
-
-
-def _synchronise_frames(
-    found: TrialSync, pulses: _Pulses, streams: SyncStreams, mid_exposure_ns: int
-) -> None:
-    """Fit the clock of the frame camera."""
-    timing, camera = pulses.timing, pulses.timing.frame_camera
-    begins = streams.frame_ns - mid_exposure_ns
-    if timing.frames == "hardware trigger":
-        coded = begins[streams.frame_sync > 0]
-        _try(found, "frames", lambda: pulses.fit("frames", coded, camera, timing.frames))
-    elif timing.frames == "exposure line":
-        _try(found, "frames", lambda: _by_exposures(begins, streams, timing))
-    elif timing.frames == "device time stamps":
-        _try(found, "frames", lambda: _frames_by_reads(streams, timing))
-    else:
-        _try(found, "frames", lambda: _frames_by_arrival(streams, timing))
 
 
 def _try(found: TrialSync, name: str, fit: Callable[[], DeviceSync]) -> None:
@@ -435,7 +430,7 @@ def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
     return _through_host(bounded, streams, timing, timing.arm)
 
 
-def _force(
+def _by_samples(
     found: TrialSync,
     name: str,
     samples: tuple[I64, I64],
@@ -443,7 +438,7 @@ def _force(
     streams: SyncStreams,
     timing: Timing,
 ) -> DeviceSync:
-    """The clock of a force sensor: the arm's, or bounded by the arrivals of its samples.
+    """The clock of a sensor: the arm's, or bounded by the arrivals of its samples.
 
     Args:
         samples: the sensor's and the host's time of each, ns.
@@ -462,26 +457,13 @@ def _force(
     return _through_host(bounded, streams, timing, how.grade)
 
 
-def _sent(device_ns: I64, arrived_ns: I64, delay: Delay) -> ClockReadings:
+def _sent(device_ns: I64, arrived_ns: I64, delay: Delay) -> ClockReads:
     """Bounds of messages' times by the host's clock: they arrived after their delay."""
-    return ClockReadings(
+    return ClockReads(
         device_ns,
         arrived_ns - round(delay.longest_us * 1000),
         arrived_ns - round(delay.shortest_us * 1000),
     )
-
-
-def _frames_by_reads(streams: SyncStreams, timing: Timing) -> DeviceSync:
-    """The host read the camera's clock now and then."""
-    drift = timing.frame_camera.drift_ppm + HOST_PPM
-    bounded = _bounded(streams.frame_camera_reads, drift, "readings of the frame camera's clock")
-    return _through_host(bounded, streams, timing, timing.frames)
-
-
-def _frames_by_arrival(streams: SyncStreams, timing: Timing) -> DeviceSync:
-    """A frame's time is its arrival; the middle of its exposure was some known time before."""
-    before_ns = streams.mid_exposure_ns or 0
-    return _by_arrival(timing.frame_delay, before_ns, timing.frames, streams, timing)
 
 
 def _by_arrival(
@@ -509,7 +491,7 @@ def _box(streams: SyncStreams, timing: Timing) -> BoundedClock:
     return _bounded(streams.box_reads, drift, "readings of the sync box's clock")
 
 
-def _bounded(reads: ClockReadings, drift_ppm: float, name: str) -> BoundedClock:
+def _bounded(reads: ClockReads, drift_ppm: float, name: str) -> BoundedClock:
     if reads.device_ns.size < MIN_PAIRS:
         raise BoundsContradictError(
             f"{reads.device_ns.size} {name}; at least {MIN_PAIRS} are needed: record for longer, "

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.detectors import (
-    EvidenceDetector,
     Learned,
     Levels,
-    Predictions,
+    Rule,
     Smoothing,
     TrialWithSlip,
     Tuned,
@@ -63,7 +62,7 @@ class TrialEvidence:
     references: References = field(default_factory=dict)
 
 
-def judge(detector: EvidenceDetector, trials: Sequence[TrialWithSlip]) -> list[TrialEvidence]:
+def judge(detector: Rule, trials: Sequence[TrialWithSlip]) -> list[TrialEvidence]:
     """Evidence of a detector on labelled trials."""
     return [TrialEvidence(detector.evidence(t.predictions), t.slip, t.references) for t in trials]
 
@@ -193,11 +192,7 @@ def compare(
 
 def thinned(trial: TrialWithSlip, every: int) -> TrialWithSlip:
     """A trial with each `every`-th of its windows, the first one among them."""
-    predictions = trial.predictions
-    retained = Predictions(
-        predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
-    )
-    return replace(trial, predictions=retained)
+    return replace(trial, predictions=trial.predictions[::every])
 
 
 def tuned(
@@ -235,7 +230,7 @@ def _quickest(
 
 def _detectors(
     learned: Learned, windows: Windows, settings: Detection, stride_ms: int
-) -> dict[str, dict[int, EvidenceDetector]]:
+) -> dict[str, dict[int, Rule]]:
     """Detectors by name; where there are several, the validation trials choose, by the number."""
     ours = learned.detectors(stride_ms / windows.length_ms)
     return {

@@ -1,13 +1,16 @@
-"""Causal detectors side by side: each turns a trial's windows into evidence, window by window.
+"""Rules of detection side by side: each turns a network's spikes into evidence, window by window.
 
-A detector returns the evidence, from all windows so far, that slip has begun; a threshold on the
-evidence makes it a detection. So detectors of any kind can be set to the same rate of false alarms
+A rule returns the evidence, from all windows so far, that slip has begun; a threshold on the
+evidence makes it a detection. So rules of any kind can be set to the same rate of false alarms
 (`detectors.detector_comparison`) and then compared by how late they are. No other comparison is
 fair: each becomes arbitrarily quick when it is allowed more false alarms.
+
+A rule is written once. Stored trials give it all their windows, a running stream one at a time.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -17,9 +20,8 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import References
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets, lead_of
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
 from sliplab.storage.kernels import njit
 
@@ -350,13 +352,18 @@ class Predictions:
         n = len(self.end_ns)
         if self.counts.shape != (n, len(CLASSES)) or self.events.shape != (n,):
             raise ValueError(
-                f"counts {self.counts.shape} and events {self.events.shape} of {n} windows"
+                f"{n} window ends for {len(self.counts)} windows: counts {self.counts.shape} and "
+                f"events {self.events.shape}; expected (n, {len(CLASSES)}) and (n,)"
             )
         if (np.diff(self.end_ns) <= 0).any():
             raise ValueError("window ends do not increase")
 
     def __len__(self) -> int:
         return len(self.end_ns)
+
+    def __getitem__(self, part: slice) -> Predictions:
+        """Return some of the windows."""
+        return Predictions(self.counts[part], self.events[part], self.end_ns[part])
 
 
 @dataclass(frozen=True)
@@ -375,85 +382,92 @@ class TrialWithSlip:
 
 @dataclass(frozen=True)
 class WindowEvidence:
-    """Output of a detector for one trial; no value depends on a later window.
+    """Evidence of windows that follow each other; no value depends on a later window.
 
     Attributes:
         end_ns: int64 (n,), end of each window.
         incipient: float64 (n,), evidence for slip from all windows up to each one.
         gross_after: the same for gross slip, given the window in which incipient slip was
-            detected; only values after that window mean anything.
+            detected; only values after that window mean anything. Of -1 where that was before.
+        smoothed: (n, 3), mean counts of the windows that the evidence rests on.
+        no_slip: float64 (n,), evidence for no slip, of a rule that has it.
     """
 
     end_ns: IntArray
     incipient: FloatArray
     gross_after: Callable[[int], FloatArray]
+    smoothed: Array = field(default_factory=lambda: np.empty((0, len(CLASSES))))
+    no_slip: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
-class Running(Protocol):
-    """A detector on a running stream: the evidence of a trial window by window, to the bit."""
+class Rule(ABC):
+    """Evidence that slip has begun.
 
-    def step(self, window: Predictions) -> tuple[float, float]:
-        """Return the evidence after one more window: for slip, and for gross slip.
+    A rule stores nothing: `push` takes its state after the last window and returns the next one.
+    So the windows of a trial at once, and one by one, give the same evidence, to the bit.
+    """
 
-        The latter means something only after `detected`.
+    @property
+    def span(self) -> int:
+        """Fewest windows that a decision is based on."""
+        return 1
 
-        Args:
-            window: of that one.
-        """
+    @abstractmethod
+    def begin(self) -> Any:
+        """Return the state before the first window."""
 
-    def detected(self) -> None:
-        """Note that incipient slip was detected in the last window."""
+    @abstractmethod
+    def push(self, state: Any, windows: Predictions) -> tuple[Any, WindowEvidence]:
+        """Return the state after the next windows, and their evidence."""
 
-
-class EvidenceDetector(Protocol):
-    """Evidence that slip has begun."""
+    def detected(self, state: Any) -> Any:
+        """Return the state, given that incipient slip was detected in the last window."""
+        return state
 
     def evidence(self, predictions: Predictions) -> WindowEvidence:
-        """The evidence of one trial."""
-
-    def begin(self) -> Running:
-        """Begin a stream of windows that come one by one."""
+        """Return the evidence of one trial."""
+        return self.push(self.begin(), predictions)[1]
 
 
 @dataclass(frozen=True)
-class Smoothing:
+class Smoothing(Rule):
     """The paper's rule: mean counts of the last `width` windows, and by how much a class leads.
 
-    The evidence is the lead in spikes.
+    The evidence is the lead over every other class in spikes, negative where the class trails, and
+    -inf before `width` windows. Means are computed from whole sums.
     """
 
     width: int
 
-    def evidence(self, predictions: Predictions) -> WindowEvidence:
-        """See `EvidenceDetector`."""
-        gross = lead_of(predictions.counts, self.width, GROSS)
-        return WindowEvidence(
-            predictions.end_ns,
-            lead_of(predictions.counts, self.width, INCIPIENT),
-            lambda first: gross,
+    @property
+    def span(self) -> int:
+        """See `Rule`."""
+        return self.width
+
+    def begin(self) -> IntArray:
+        """See `Rule`; the counts of the last ``width - 1`` windows."""
+        return np.empty((0, len(CLASSES)), np.int64)
+
+    def push(self, state: IntArray, windows: Predictions) -> tuple[IntArray, WindowEvidence]:
+        """See `Rule`."""
+        every = np.concatenate([state, windows.counts])
+        sums = np.zeros((len(every) + 1, len(CLASSES)), np.int64)
+        sums[1:] = every.cumsum(axis=0)
+        stop = np.arange(len(state), len(every)) + 1
+        start = np.maximum(stop - self.width, 0)
+        trailing, held = sums[stop] - sums[start], stop - start
+
+        def lead(target: int) -> FloatArray:
+            rivals = np.delete(trailing, target, axis=1).max(axis=1, initial=0)
+            found: FloatArray = (trailing[:, target] - rivals) / self.width
+            found[held < self.width] = -np.inf
+            return found
+
+        no_slip, incipient, gross = (lead(k) for k in range(len(CLASSES)))
+        found = WindowEvidence(
+            windows.end_ns, incipient, lambda first: gross, trailing / held[:, None], no_slip
         )
-
-    def begin(self) -> Running:
-        """See `EvidenceDetector`."""
-        return _RunningSmoothing(self.width)
-
-
-class _RunningSmoothing:
-    """`Smoothing` of the last windows."""
-
-    def __init__(self, width: int) -> None:
-        self._width = width
-        self._last = np.empty((0, len(CLASSES)), np.int64)
-
-    def step(self, window: Predictions) -> tuple[float, float]:
-        self._last = np.concatenate([self._last, window.counts])[-self._width :]
-        incipient, gross = (
-            float(lead_of(self._last, self._width, it)[-1]) for it in (INCIPIENT, GROSS)
-        )
-        return incipient, gross
-
-    def detected(self) -> None:
-        """Nothing depends on it."""
+        return every[max(len(every) - self.width + 1, 0) :], found
 
 
 @dataclass(frozen=True)
@@ -477,78 +491,57 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Filter:
+class Filter(Rule):
     """The hidden Markov filter; the evidence is log odds."""
 
     chain: StateChain
     reading: Reading
 
-    def evidence(self, predictions: Predictions) -> WindowEvidence:
-        """See `EvidenceDetector`."""
-        belief = forward(self.chain, self.reading.log(predictions))
-        gross = log_odds(belief, GROSS)
-        return WindowEvidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
+    def begin(self) -> FloatArray:
+        """See `Rule`; the log probabilities of the states, float64 (states,)."""
+        return _first_state(self.chain)
 
-    def begin(self) -> Running:
-        """See `EvidenceDetector`."""
-        return _RunningFilter(self)
-
-
-class _RunningFilter:
-    """`Filter` from the belief after the last window on."""
-
-    def __init__(self, filtered: Filter) -> None:
-        self._filter, self._belief = filtered, _first_state(filtered.chain)
-
-    def step(self, window: Predictions) -> tuple[float, float]:
-        log = self._filter.reading.log(window)
-        belief = _advanced(self._filter.chain, self._belief, log)
-        return float(log_odds(belief, INCIPIENT)[0]), float(log_odds(belief, GROSS)[0])
-
-    def detected(self) -> None:
-        """Nothing depends on it."""
+    def push(self, state: FloatArray, windows: Predictions) -> tuple[FloatArray, WindowEvidence]:
+        """See `Rule`."""
+        beliefs = _advanced(self.chain, state.copy(), self.reading.log(windows))
+        gross = log_odds(beliefs, GROSS)
+        found = WindowEvidence(
+            windows.end_ns, log_odds(beliefs, INCIPIENT), lambda first: gross, windows.counts
+        )
+        return beliefs[-1] if len(beliefs) else state, found
 
 
 @dataclass(frozen=True)
-class Cusum:
+class Cusum(Rule):
     """Page's test of no slip against incipient slip; after that, of incipient against gross."""
 
     reading: Reading
 
-    def evidence(self, predictions: Predictions) -> WindowEvidence:
-        """See `EvidenceDetector`."""
-        log = self.reading.log(predictions)
+    def begin(self) -> tuple[float, float]:
+        """See `Rule`; the statistics of both tests."""
+        return 0.0, 0.0
+
+    def push(
+        self, state: tuple[float, float], windows: Predictions
+    ) -> tuple[tuple[float, float], WindowEvidence]:
+        """See `Rule`."""
+        log = self.reading.log(windows)
+        slip = cusum(log[:, INCIPIENT] - log[:, NO_SLIP], state[0])
         ratio = log[:, GROSS] - log[:, INCIPIENT]
 
         def gross_after(first: int) -> FloatArray:
             out = np.zeros(len(ratio))
-            out[first + 1 :] = cusum(ratio[first + 1 :])
+            out[first + 1 :] = cusum(ratio[first + 1 :], state[1] if first < 0 else 0.0)
             return out
 
-        return WindowEvidence(
-            predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after
-        )
+        found = WindowEvidence(windows.end_ns, slip, gross_after, windows.counts)
+        if not len(slip):
+            return state, found
+        return (float(slip[-1]), float(gross_after(-1)[-1])), found
 
-    def begin(self) -> Running:
-        """See `EvidenceDetector`."""
-        return _RunningCusum(self.reading)
-
-
-class _RunningCusum:
-    """`Cusum` from its statistics after the last window on."""
-
-    def __init__(self, reading: Reading) -> None:
-        self._reading = reading
-        self._incipient = self._gross = 0.0
-
-    def step(self, window: Predictions) -> tuple[float, float]:
-        log = self._reading.log(window)
-        self._incipient = float(cusum(log[:, INCIPIENT] - log[:, NO_SLIP], self._incipient)[0])
-        self._gross = float(cusum(log[:, GROSS] - log[:, INCIPIENT], self._gross)[0])
-        return self._incipient, self._gross
-
-    def detected(self) -> None:
-        self._gross = 0.0
+    def detected(self, state: tuple[float, float]) -> tuple[float, float]:
+        """See `Rule`; the second test begins."""
+        return state[0], 0.0
 
 
 @dataclass(frozen=True)
@@ -561,11 +554,22 @@ class Levels:
 
 @dataclass(frozen=True)
 class Tuned:
-    """A detector with the levels that validation trials set."""
+    """A rule with its levels, such as validation trials set."""
 
     name: str
-    detector: EvidenceDetector
+    detector: Rule
     levels: Levels
+
+    def classes(self, evidence: WindowEvidence, gross_found: bool) -> npt.NDArray[np.int8]:
+        """Return the class of each window, int8 (n,); -1 where none is valid.
+
+        Gross slip once that was detected, incipient slip where its evidence exceeds the level.
+
+        Args:
+            gross_found: gross slip was detected in one of the windows or before.
+        """
+        slips = np.where(evidence.incipient > self.levels.incipient, INCIPIENT, NO_SLIP)
+        return np.full_like(slips, GROSS, np.int8) if gross_found else slips.astype(np.int8)
 
 
 def decide(evidence: WindowEvidence, levels: Levels) -> DetectedOnsets:
@@ -609,7 +613,7 @@ class Learned:
     chain: StateChain
     readings: dict[str, Reading]
 
-    def detectors(self, stride_share: float) -> dict[str, EvidenceDetector]:
+    def detectors(self, stride_share: float) -> dict[str, Rule]:
         """A filter and a test for each reading, by name.
 
         Args:

@@ -17,7 +17,6 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
@@ -29,6 +28,21 @@ from sliplab.storage.schema.label import KINDS, Kind, TrialLabel
 
 NEVER = int(np.iinfo(np.int64).max)
 """The time of an onset that was not detected, in arrays of times."""
+
+
+@dataclass(frozen=True)
+class DetectedOnsets:
+    """The onsets that a detector found in one trial.
+
+    Attributes:
+        incipient_ns: estimated incipient onset, nanoseconds on the time line of the windows, or
+            None if it was never detected.
+        gross_ns: estimated gross onset, the first valid one after the incipient detection; None
+            if there was none, or no incipient detection before it.
+    """
+
+    incipient_ns: int | None
+    gross_ns: int | None
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,16 @@ events give the same windows, counts and decisions. What a stream does that a fi
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.detectors.detectors import Predictions, Tuned
-from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP, winners
+from sliplab.analysis.detectors.smoothing_rule import paper_rule
+from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.detection import Detection
@@ -157,80 +157,27 @@ class RuleStep:
     onset: str | None
 
 
-class LiveRule(Protocol):
-    """The decision rule applied after each window.
+class RunningRule:
+    """A rule at its levels, window by window: the decisions of the whole trial, to the bit.
 
-    Attributes:
-        width: fewest windows that a decision is based on.
+    After an interruption evidence is reset; onsets stay.
+
+    Args:
+        detection: the paper's rule by its settings, or another rule with its levels.
     """
 
-    width: int
+    def __init__(self, detection: Detection | Tuned) -> None:
+        self._tuned = paper_rule(detection) if isinstance(detection, Detection) else detection
+        self._windows, self._incipient, self._gross = 0, False, False
+        self._state: Any = self._tuned.detector.begin()
 
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> RuleStep:
-        """Take the output spikes, integer (3,), and events of the window after the last one."""
-
-    def interrupt(self) -> None:
-        """Forget the windows, as the next one does not follow them."""
-
-
-def rule_of(detection: Detection | Tuned) -> LiveRule:
-    """Return the paper's rule by its settings, or another detector at its levels."""
-    return StepRule(detection) if isinstance(detection, Detection) else StepDetector(detection)
-
-
-class StepDetector:
-    """A detector at its levels, window by window.
-
-    A window is of gross slip once that was detected, of incipient slip where its evidence exceeds
-    the level. After an interruption evidence is reset; onsets stay.
-    """
-
-    width = 1
-
-    def __init__(self, tuned: Tuned) -> None:
-        self._tuned, self._windows = tuned, 0
-        self._incipient = self._gross = False
-        self.interrupt()
-
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int) -> RuleStep:
-        """See `LiveRule`."""
-        self._windows += 1
-        row = np.asarray(counts).astype(np.int64)
-        seen = Predictions(row[None], np.array([events]), np.array([self._windows]))
-        incipient, gross = self._running.step(seen)
-        levels, onset = self._tuned.levels, None
-        if not self._incipient:
-            if incipient > levels.incipient:
-                self._incipient, onset = True, CLASSES[INCIPIENT]
-                self._running.detected()
-        elif not self._gross and gross > levels.gross:
-            self._gross, onset = True, CLASSES[GROSS]
-        slips = INCIPIENT if incipient > levels.incipient else NO_SLIP
-        a, b, c = row.tolist()
-        return RuleStep((a, b, c), GROSS if self._gross else slips, onset)
-
-    def interrupt(self) -> None:
-        """See `LiveRule`."""
-        self._running = self._tuned.detector.begin()
-        if self._incipient:
-            self._running.detected()
-
-
-class StepRule:
-    """The rule of `analysis.detectors.smoothing_rule.detect`, window by window, to the bit.
-
-    `detect` sees a whole trial at once; this holds the last `smoothing` rows and no more.
-    """
-
-    def __init__(self, settings: Detection) -> None:
-        self.width = settings.smoothing
-        self._lead = settings.margin * settings.smoothing
-        self._held: deque[npt.NDArray[np.int64]] = deque()
-        self._sum = np.zeros(len(CLASSES), np.int64)
-        self._incipient = self._gross = False
+    @property
+    def span(self) -> int:
+        """Fewest windows that a decision is based on."""
+        return self._tuned.detector.span
 
     def step(self, counts: npt.NDArray[np.integer[Any]], events: int = 0) -> RuleStep:
-        """See `LiveRule`; events do not matter.
+        """Take the output spikes, integer (3,), and events of the window after the last one.
 
         Raises:
             ValueError: another shape or type.
@@ -238,30 +185,26 @@ class StepRule:
         row = np.asarray(counts)
         if row.shape != (len(CLASSES),) or not np.issubdtype(row.dtype, np.integer):
             raise ValueError(f"counts are {row.dtype} {row.shape}; expected integers (3,)")
-        row = row.astype(np.int64)
-        self._held.append(row)
-        self._sum = self._sum + row
-        if len(self._held) > self.width:
-            self._sum = self._sum - self._held.popleft()
-        valid = -1
-        if len(self._held) == self.width:
-            valid = int(winners(self._sum[None], self._lead)[0])
-        a, b, c = (self._sum / len(self._held)).tolist()
-        return RuleStep((a, b, c), valid, self._onset(valid))
+        self._windows += 1
+        window = Predictions(
+            row[None].astype(np.int64), np.array([events]), np.array([self._windows])
+        )
+        rule, levels = self._tuned.detector, self._tuned.levels
+        self._state, evidence = rule.push(self._state, window)
+        onset = None
+        if not self._incipient:
+            if evidence.incipient[0] > levels.incipient:
+                self._incipient, onset = True, CLASSES[INCIPIENT]
+                self._state = rule.detected(self._state)
+        elif not self._gross and evidence.gross_after(-1)[0] > levels.gross:
+            self._gross, onset = True, CLASSES[GROSS]
+        a, b, c = evidence.smoothed[0].tolist()
+        return RuleStep((a, b, c), int(self._tuned.classes(evidence, self._gross)[0]), onset)
 
     def interrupt(self) -> None:
-        """Reset the windows, as the next one does not follow them; keep the onsets."""
-        self._held.clear()
-        self._sum = np.zeros(len(CLASSES), np.int64)
-
-    def _onset(self, valid: int) -> str | None:
-        if not self._incipient:
-            self._incipient = valid == INCIPIENT
-            return CLASSES[INCIPIENT] if self._incipient else None
-        if not self._gross and valid == GROSS:
-            self._gross = True
-            return CLASSES[GROSS]
-        return None
+        """Forget the windows, as the next one does not follow them."""
+        rule = self._tuned.detector
+        self._state = rule.detected(rule.begin()) if self._incipient else rule.begin()
 
 
 Counting = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.int64]]
@@ -330,7 +273,7 @@ class LiveDetector:
         back_us: int = BACK_US,
     ) -> None:
         self._counts, self._windows = counts, windows
-        self._rule = rule_of(detection)
+        self._rule = RunningRule(detection)
         self._geometry = (width, height, centre_px)
         self._length_us = windows.length_ms * 1000
         self._stride_us = self._length_us if stride_us is None else stride_us
@@ -362,7 +305,7 @@ class LiveDetector:
     @property
     def span_us(self) -> int:
         """Span of the windows that a decision rests on."""
-        return self._length_us + (self._rule.width - 1) * self._stride_us
+        return self._length_us + (self._rule.span - 1) * self._stride_us
 
     @property
     def open_windows(self) -> int:
@@ -382,9 +325,7 @@ class LiveDetector:
         edges = np.flatnonzero(np.diff(chunk.t_us) > self._gap_us) + 1
         made = []
         for part in np.split(np.arange(len(chunk)), edges) if len(edges) else [slice(None)]:
-            made += self._push(
-                EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-            )
+            made += self._push(chunk[part])
         return made
 
     def advance(self, to_us: int) -> list[LiveDecision]:
@@ -415,8 +356,7 @@ class LiveDetector:
         before = np.maximum.accumulate(np.concatenate([t_us[:1], t_us[:-1]]))
         disordered = int(np.count_nonzero(t_us < before))
         if disordered:
-            order = np.argsort(t_us, kind="stable")
-            chunk = EventChunk(chunk.x[order], chunk.y[order], chunk.p[order], t_us[order])
+            chunk = chunk[np.argsort(t_us, kind="stable")]
         self.losses.disordered += disordered
         if self._judged_us is not None:
             self.losses.late += int(np.searchsorted(chunk.t_us, self._judged_us))
@@ -443,9 +383,7 @@ class LiveDetector:
         window = self._opened(number, start_us)
         if begin == end:
             return
-        part = slice(begin, end)
-        inside = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-        more = self._bin(inside, start_us)
+        more = self._bin(chunk[begin:end], start_us)
         # 255 stays 255, as if all had been counted at once
         window.x += np.minimum(more, 255 - window.x)
         window.events += end - begin
@@ -521,9 +459,7 @@ class LiveDetector:
         return low
 
 
-_NO_EVENTS = EventChunk(
-    np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8), np.empty(0, np.int64)
-)
+_NO_EVENTS = EventChunk.empty()
 
 
 SPAN_NS = 5_000_000_000

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from sliplab.analysis.detectors.latency import (
+    DetectedOnsets,
     TrueSlip,
     is_false_early,
     median_span,
@@ -23,7 +24,6 @@ from sliplab.analysis.detectors.latency import (
     slip_of,
     summarise_latency,
 )
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.labels.label_errors import true_onset_ns
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.detection import Detection

@@ -1,8 +1,8 @@
 """The paper's rule at every smoothing and margin of a grid: detections, scores and the choice.
 
-A search needs dozens of pairs on every trial of every network, so `sweep` computes the sums over
-windows once for all margins. Tests hold each pair to `smoothing_rule.detect`, each
-figure to `analysis.detectors.latency` and `choose_pair` to `choose_smoothing`.
+A search needs dozens of pairs on every trial of every network, so `sweep` computes the leads once
+for all margins, and arrays of times are scored. Tests hold each figure to
+`analysis.detectors.latency`.
 
 The paper chose its window by the latency on test trials, and then reported that latency. Here the
 choice is made on validation trials unless the paper's way is requested. A bound on the rate of
@@ -21,21 +21,21 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.detectors.detector_comparison import allowed_early, merit
+from sliplab.analysis.detectors.detectors import Levels, Predictions, Smoothing, decide
 from sliplab.analysis.detectors.latency import (
     NEVER,
+    DetectedOnsets,
     TrueSlip,
     is_false_early,
     is_late,
     score_trial,
     summarise_latency,
 )
-from sliplab.analysis.detectors.smoothing_rule import detect, lead_of
-from sliplab.analysis.metrics.classification import GROSS, INCIPIENT
+from sliplab.analysis.detectors.smoothing_rule import paper_level
 from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import RuleChoice
 
 I64 = npt.NDArray[np.int64]
-F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 
@@ -126,24 +126,16 @@ def sweep(
         int64 (smoothings, margins, 2): incipient and gross detection, `NEVER` where there is none.
     """
     found = np.full((len(smoothings), len(margins), 2), NEVER, np.int64)
+    windows = Predictions(counts.astype(np.int64), counts.sum(axis=1), end_ns)
     for s, smoothing in enumerate(smoothings):
-        slips = [lead_of(counts, smoothing, target) for target in (INCIPIENT, GROSS)]
+        evidence = Smoothing(smoothing).evidence(windows)
         for m, margin in enumerate(margins):
-            first = _first(slips[0], margin, 0)
-            if first is None:
-                continue
-            found[s, m, 0] = end_ns[first]
-            second = _first(slips[1], margin, first + 1)
-            if second is not None:
-                found[s, m, 1] = end_ns[second]
+            level = paper_level(margin)
+            onsets = decide(evidence, Levels(level, level))
+            for k, onset in enumerate((onsets.incipient_ns, onsets.gross_ns)):
+                if onset is not None:
+                    found[s, m, k] = onset
     return found
-
-
-def _first(lead: F64, margin: float, start: int) -> int | None:
-    """The first window from `start` on where a class leads by the margin, and leads at all."""
-    there = lead[start:] >= margin if margin > 0 else lead[start:] > 0
-    at = int(there.argmax()) if there.size else 0
-    return start + at if there.size and there[at] else None
 
 
 def score(found: I64, trials: Trials) -> Figures:
@@ -176,7 +168,7 @@ def score(found: I64, trials: Trials) -> Figures:
 def choose_pair(
     found: I64, trials: Trials, smoothings: Sequence[int], margins: Sequence[float], rate: float
 ) -> tuple[int, int]:
-    """Places of the pair that `choose_smoothing` would choose.
+    """Places of the pair that `choose_smoothing` chooses; see there.
 
     Args:
         found: int64 (n, smoothings, margins, 2), n at least 1.
@@ -228,21 +220,17 @@ def choose_smoothing(trials: Sequence[SpikeCounts], settings: Detection, split: 
     """
     if not trials:
         raise ValueError(f"no {split} trials with both onsets to choose by")
-    allowed = allowed_early(settings.false_early_rate, len(trials))
     tolerance = round(settings.false_early_ms * 1e6)
-    found = []
-    for smoothing in settings.smoothing_grid:
-        for margin in settings.margin_grid:
-            tried = settings.model_copy(update={"smoothing": smoothing, "margin": margin})
-            scored = [
-                score_trial(detect(t.counts, t.end_ns, tried), t.slip, tolerance) for t in trials
-            ]
-            out = [sum(each) for each in zip(*(t.uncounted for t in scored), strict=True)]
-            median, high = merit(scored)
-            excess = sum(max(n - allowed, 0) for n in out)
-            rank = (excess, median, high, sum(out[:2]), smoothing, -margin)
-            found.append((rank, scored))
-    (_, median, *_, smoothing, negative), scored = min(found, key=lambda entry: entry[0])
+    grid = settings.smoothing_grid, settings.margin_grid
+    found = np.stack([sweep(t.counts, t.end_ns, *grid) for t in trials])
+    columns = zip(*((*vars(t.slip).values(), tolerance) for t in trials), strict=True)
+    known = Trials(*(np.array(times, np.int64) for times in columns))
+    s, m = choose_pair(found, known, *grid, settings.false_early_rate)
+    scored = []
+    for onsets, trial in zip(found[:, s, m].tolist(), trials, strict=True):
+        detected = DetectedOnsets(*(None if ns == NEVER else ns for ns in onsets))
+        scored.append(score_trial(detected, trial.slip, tolerance))
+    median, _ = merit(scored)
     latency = summarise_latency(scored)
     counts = {
         f"{name}{suffix}": getattr(figures, name)
@@ -250,11 +238,11 @@ def choose_smoothing(trials: Sequence[SpikeCounts], settings: Detection, split: 
         for name in ("false_early", "missed", "late")
     }
     return RuleChoice(
-        smoothing=int(smoothing),
-        margin=-negative,
+        smoothing=settings.smoothing_grid[s],
+        margin=settings.margin_grid[m],
         split=split,
         trials=len(trials),
-        allowed=allowed,
+        allowed=allowed_early(settings.false_early_rate, len(trials)),
         median_ms=median if np.isfinite(median) else None,
         **counts,
     )

@@ -30,7 +30,6 @@ from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
-from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
@@ -60,7 +59,8 @@ class OtherNetwork:
         content: its file's bytes: a model file of this program, or weights of `description`.
         windows: what it takes.
         outputs_per_class: in the mean.
-        engine: counts its spikes: the event-driven kernels, or Sinabs.
+        engine: counts its spikes: the event-driven kernels, or Sinabs; ``predictions`` where
+            another program did.
         exact: whether both give the same counts by arithmetic.
     """
 
@@ -70,7 +70,7 @@ class OtherNetwork:
     description: Description | None
     windows: Windows
     outputs_per_class: float
-    engine: Engines
+    engine: Engines | Literal["predictions"]
     exact: bool
 
     @cached_property
@@ -201,6 +201,11 @@ class Judgement:
         )
 
     @property
+    def applied(self) -> dict[str, Detection]:
+        """The rules in the unit of the stored counts."""
+        return self.rules
+
+    @property
     def fresh(self) -> bool:
         """True where nothing changed since it was evaluated."""
         return Derived.of(self.store, STEP).fresh(self.network.name, self.key)
@@ -228,7 +233,7 @@ class Judgement:
                 seed = hash_integer("samples", trial.id)
                 judging = _Judging(network, label, samples, seed, stride, threads)
                 work.append(TrialWork(recording, item.name, key, judging))
-        step = _counts_step(network)
+        step = counts_step(network)
         if stale := stale_trials(self.store, step, work):
             keep(step, stale, _count)
 
@@ -315,7 +320,8 @@ def retained(
     return found
 
 
-def _counts_step(network: OtherNetwork) -> str:
+def counts_step(network: OtherNetwork) -> str:
+    """Return the step that stores its counts of the test trials."""
     return f"counts-{network.name}"
 
 
@@ -325,12 +331,10 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     if judging.threads is not None:
         training.limit_threads(judging.threads)
     counts = _counter(network.content, network.description, network.engine)
-    length_ns = network.windows.length_ms * 1_000_000
-    span = dataset.recorded_span(recording)
-    starts = strided_windows(*span, length_ns, judging.stride_ms * 1_000_000)
+    starts = dataset.run_starts(recording, network.windows, judging.stride_ms)
     found = {
         "counts": counts(dataset.cut_windows(recording, starts, network.windows)),
-        "end_ns": starts + length_ns,
+        "end_ns": starts + network.windows.length_ms * 1_000_000,
     }
     if judging.label is not None:
         trial = dataset.TrialId(recording.folder.parents[1].name, recording.folder.name)
@@ -343,7 +347,7 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
 
 @lru_cache(maxsize=2)
 def _counter(
-    content: bytes, description: Description | None, engine: Engines
+    content: bytes, description: Description | None, engine: str
 ) -> Callable[[SparseWindows], I64]:
     """A function from windows to output spikes int64 (n, 3), each window from rest."""
     if description is None:
@@ -366,18 +370,19 @@ def score_network(job: Judgement) -> None:
     counts: list[I64] = []
     labels: list[I64] = []
     places: list[I64] = []
+    rules = job.applied
     for item in job.campaigns:
-        made = Derived.of(job.store, _counts_step(network), item.name)
+        made = Derived.of(job.store, counts_step(network), item.name)
         for trial, recording in item.of_split("test"):
             arrays = made.arrays(recording.folder.name)
             label = job.labels.read(item, recording)
-            rule = job.rules[item.name]
+            rule = rules[item.name]
             rows.append(score_row(item, trial, label, arrays["counts"], arrays["end_ns"], rule))
             if "y" in arrays:
                 counts.append(arrays["sample_counts"])
                 labels.append(arrays["y"])
                 places.append(np.full(len(arrays["y"]), len(places), np.int64))
-    margin = job.rules[training_campaigns(job.campaigns)[0].name].margin
+    margin = rules[training_campaigns(job.campaigns)[0].name].margin
     result = OtherEvaluation(
         data_key=job.data_key,
         title=network.title,

@@ -176,7 +176,7 @@ def bases(recording: Recording, layout_mm: F64, t_ns: I64, start_ns: int) -> F64
 
 def _between(events: EventChunk, begin_us: int, end_us: int) -> EventChunk:
     part = slice(*np.searchsorted(events.t_us, (begin_us, end_us)).tolist())
-    return EventChunk(events.x[part], events.y[part], events.p[part], events.t_us[part])
+    return events[part]
 
 
 def _directions(base: F64, way: F64) -> F64:

@@ -105,10 +105,7 @@ def without_hot_pixels(events: EventChunk, size_px: tuple[int, int]) -> EventChu
     place = events.y.astype(np.int64) * width + events.x
     sign = np.where(events.p > 0, 1.0, -1.0)
     net = np.bincount(place, weights=sign, minlength=width * height)
-    retained = np.abs(net[place]) <= HOT
-    return EventChunk(
-        events.x[retained], events.y[retained], events.p[retained], events.t_us[retained]
-    )
+    return events[np.abs(net[place]) <= HOT]
 
 
 def find_discs(events: EventChunk, layout_mm: F64, size_px: tuple[int, int]) -> Discs | None:

@@ -15,7 +15,8 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Content, Figure, Table, number
-from sliplab.protocols import Trial
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.recorded import RecordedPlan
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.summary import (
     DriftTrend,
@@ -62,7 +63,16 @@ def collected_section(
     campaigns: Sequence[Collected], summary: Summary | OneCameraSummary
 ) -> CollectedSection:
     """Compare plans and committed trials."""
-    grids = [grid for item in campaigns if (grid := _grid(item, summary.simulated)) is not None]
+    grids = [
+        grid
+        for item in campaigns
+        if (
+            grid := grid_figure(
+                item.name, item.planned, [it for it, _ in item.trials], simulated=summary.simulated
+            )
+        )
+        is not None
+    ]
     rows = []
     for item in campaigns:
         known = summary.planned[item.name]
@@ -117,20 +127,22 @@ def source_words(summary: Summary | OneCameraSummary) -> str:
     return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
 
 
-def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
-    """Draw the trials by the first two factors; None if there are fewer."""
-    names = list(item.planned.levels)[:2]
+def grid_figure(
+    campaign: str, plan: Plan | RecordedPlan, committed: Sequence[Trial], *, simulated: bool
+) -> tuple[str, str, str, Figure] | None:
+    """Draw the trials by the first two factors, with their names; None if there are fewer."""
+    names = list(plan.levels)[:2]
     if len(names) < 2:
         return None
-    levels = [item.planned.levels[name] for name in names]
+    levels = [plan.levels[name] for name in names]
     shape = (len(levels[0]), len(levels[1]))
     counts, planned = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
 
     def cell(trial: Trial) -> tuple[int, int]:
-        there = item.describe(trial)
+        there = plan.describe(trial)
         return levels[0].index(there[names[0]]), levels[1].index(there[names[1]])
 
-    for of, trials in ((planned, item.planned), (counts, [trial for trial, _ in item.trials])):
+    for of, trials in ((planned, plan), (counts, committed)):
         for trial in trials:
             if trial.role == "measured":
                 of[cell(trial)] += 1
@@ -148,7 +160,7 @@ def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | No
     svg = figures.collected_grid(
         shown[0], shown[1], counts, planned, axes[0], axes[1], simulated=simulated
     )
-    return item.name, names[0], names[1], Figure(svg, name=f"collected-{item.name}", data=data)
+    return campaign, names[0], names[1], Figure(svg, name=f"collected-{campaign}", data=data)
 
 
 @dataclass(frozen=True)
@@ -189,13 +201,14 @@ def quality_section(
             for name, found in references.items()
             for key, trend in found.wear.items()
         ],
-        [(item.name, _over_campaign(item, stream, simulated)) for item in taken],
+        [(item.name, campaign_figure(item, stream, simulated)) for item in taken],
         [(name, _references(name, found.trials, simulated)) for name, found in references.items()],
         [*_depth_zeros(taken), *(table for item in taken for table in _gates(item))],
     )
 
 
-def _over_campaign(item: Collected, stream: str, simulated: bool) -> Figure:
+def campaign_figure(item: Collected, stream: str, simulated: bool) -> Figure:
+    """Draw event rate, tightest gate and failed attempts over the plan."""
     numbers = [trial.index + 1 for trial, _ in item.trials]
     records = [recording.record for _, recording in item.trials]
     rates = [getattr(record.counts, stream) / record.recorded_s for record in records]

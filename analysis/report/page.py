@@ -43,6 +43,10 @@ class Figure:
     name: str = ""
     data: Mapping[str, Sequence[object]] = field(default_factory=dict)
 
+    def _repr_svg_(self) -> str:
+        """Return the picture, for a notebook."""
+        return self.svg
+
 
 @dataclass(frozen=True)
 class Table:

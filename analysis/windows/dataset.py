@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.windows.samples import choose_windows, consecutive_windows
+from sliplab.analysis.windows.samples import choose_windows, consecutive_windows, strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
 from sliplab.protocols.windows import SampleSettings, Windows
@@ -159,6 +159,28 @@ def _span_of_rows(recording: Recording) -> tuple[int, int]:
     return (min(ends), max(ends)) if ends else (0, 0)
 
 
+def sample_starts(
+    recording: Recording,
+    label: TrialLabel,
+    windows: Windows,
+    samples: SampleSettings,
+    seed: int,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Start of each window that is a sample, ns, and its class, both (n,); see `trial_samples`."""
+    chosen = choose_windows(
+        *recorded_span(recording),
+        label.incipient_ns,
+        label.gross_ns,
+        windows.length_ms * 1_000_000,
+        samples.per_class,
+        seed,
+        samples.no_slip,
+    )
+    starts = np.concatenate([chosen[key] for key in sorted(chosen)])
+    classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])
+    return starts, classes
+
+
 def trial_samples(
     recording: Recording,
     label: TrialLabel,
@@ -174,19 +196,7 @@ def trial_samples(
         trial: what the samples carry.
         seed: of the random windows within incipient slip.
     """
-    start, end = recorded_span(recording)
-    chosen = choose_windows(
-        start,
-        end,
-        label.incipient_ns,
-        label.gross_ns,
-        windows.length_ms * 1_000_000,
-        samples.per_class,
-        seed,
-        samples.no_slip,
-    )
-    starts = np.concatenate([chosen[key] for key in sorted(chosen)])
-    classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])
+    starts, classes = sample_starts(recording, label, windows, samples, seed)
     return SampleSet(
         cut_windows(recording, starts, windows),
         classes,
@@ -240,6 +250,19 @@ def span_samples(
         begins,
         (trial,),
     )
+
+
+def run_starts(
+    recording: Recording, windows: Windows, stride_ms: int | None
+) -> npt.NDArray[np.int64]:
+    """Start of each window in which slip is detected, ns, (n,).
+
+    Args:
+        stride_ms: from one to the next; None for a window's length.
+    """
+    length_ns = windows.length_ms * 1_000_000
+    stride_ns = (stride_ms or windows.length_ms) * 1_000_000
+    return strided_windows(*recorded_span(recording), length_ns, stride_ns)
 
 
 def trial_windows(

@@ -29,7 +29,7 @@ from sliplab.flows.running.cluster import connected
 from sliplab.flows.scene_runs import changed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.levels import at_level, choose_level
+from sliplab.rigs.mock.levels import at_level, choose_level
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
 

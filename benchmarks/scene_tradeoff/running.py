@@ -20,7 +20,7 @@ from benchmarks.scene_tradeoff.variants import (
 from sliplab.flows.scene_runs import SceneRun, changed, ideal, run, timed
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
-from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
+from sliplab.rigs.mock.levels import HIGHEST, expected_onsets, slides_of
 from sliplab.rigs.mock.settings import skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets

@@ -21,7 +21,7 @@ from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.scene_runs import SceneRun, changed, run, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
-from sliplab.rigs.levels import HIGHEST, slides_of, with_level
+from sliplab.rigs.mock.levels import HIGHEST, slides_of, with_level
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.rig_file import RigFile

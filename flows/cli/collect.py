@@ -17,6 +17,8 @@ from sliplab.flows.cli.common import (
     StoreOption,
     finish,
 )
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import CollectOptions
 from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
 
@@ -96,52 +98,21 @@ def check(
 @app.command(
     rich_help_panel=COLLECT, epilog="Example: sliplab collect pilot --rig mock --store my-store"
 )
+@model_options
 def collect(
     protocol: ProtocolArgument,
     rig: RigOption,
     store: StoreOption,
-    enable: EnableOption = None,
-    trials: Annotated[
-        int | None,
-        typer.Option("--trials", min=1, max=1_000_000, help="Collect at most this many trials."),
-    ] = None,
-    campaign: Annotated[
-        str | None,
-        typer.Option("--campaign", help="Campaign name; default: the protocol's name."),
-    ] = None,
-    operator: Annotated[
-        str, typer.Option("--operator", help="Name of the operator at the rig.")
-    ] = "",
-    temperature: Annotated[
-        float | None,
-        typer.Option("--temperature", min=-50, max=100, help="Room temperature, degrees Celsius."),
-    ] = None,
-    humidity: Annotated[
-        float | None, typer.Option("--humidity", min=0, max=100, help="Relative humidity, percent.")
-    ] = None,
-    note: Annotated[str, typer.Option("--note", help="A note to store with the session.")] = "",
-    no_stopping: Annotated[
-        bool,
-        typer.Option("--no-stopping", help="Go on where the protocol's claims would end it."),
-    ] = False,
+    options: CollectOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Collect the missing trials. Ctrl-C stops the arm; run the same command to resume."""
-    from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
+    from sliplab.flows.planning.run_request import check_disk, make_request
     from sliplab.flows.register import registration_line
     from sliplab.flows.running import orchestration
     from sliplab.storage.trials.store import Store
 
-    run_request = make_request(
-        protocol,
-        rig,
-        store,
-        enable=tuple(enable or ()),
-        campaign=campaign,
-        metadata=SessionMetadata(operator, temperature, humidity, note),
-        most=trials,
-        claims="overrule" if no_stopping else "use",
-    )
+    run_request = make_request(protocol, rig, store, **options.arguments())
     for warning in run_request.plan.warnings():
         console.say(f"note: {warning}")
     console.say(registration_line(Store(store).campaign(run_request.campaign), run_request.plan))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sliplab.flows.running import console
-from sliplab.flows.steps import prepare_store, run_step
+from sliplab.flows.steps import located, prepare_store, run_step
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
@@ -52,30 +50,6 @@ CampaignOption = Annotated[
 ]
 
 
-def located(place: str) -> Path:
-    """Return a store's folder: the folder itself, or the updated mirror of a URL.
-
-    Raises:
-        StoreError: it does not exist.
-    """
-    from sliplab.storage.remote.mirror import open_mirror
-    from sliplab.storage.remote.objects import is_url
-
-    if not is_url(place):
-        return Path(place)
-    with console.bar(f"read {place} (trials)", 0) as bar:
-
-        def seen(name: str) -> None:
-            bar.extend(1)
-            bar.advance(1, name)
-
-        store, done = open_mirror(place, seen)
-    for problem in done.problems:
-        console.say(f"skipped: {problem}")
-    console.say(f"working on {store.folder}; events and videos are downloaded when first read")
-    return store.folder
-
-
 def step(place: str, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
     """Run one analysis step on a store and print its result."""
     finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
@@ -91,36 +65,6 @@ def finish(result: Mapping[str, object], title: str, as_json: bool) -> None:
         for key, value in result.items()
     }
     console.print_pairs(title, shown)
-
-
-FAULTS = ("warnings", "salvaged", "left_out", "failed")
-"""Keys of an import's result that are printed to stderr, a line each."""
-
-
-def say_faults(result: Mapping[str, Any]) -> None:
-    """Print the warnings of an import, and the trials that could not be imported."""
-    for text in result.get("warnings", ()):
-        console.say(f"warning: {text}")
-    for item in result.get("failed", ()):
-        console.say(f"not imported: {item['trial']}: {item['reason']}")
-
-
-@contextmanager
-def new_store(place: Path) -> Iterator[Store]:
-    """Yield the store at `place`; one that is made here is removed again if it stays empty."""
-    there = place.is_dir() and any(place.iterdir())
-    existed = place.exists()
-    from sliplab.storage.trials.store import Store
-
-    store = Store.create(place)
-    try:
-        yield store
-    except BaseException:
-        if not there and not store.campaigns():
-            shutil.rmtree(place)
-            if existed:
-                place.mkdir()
-        raise
 
 
 def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:

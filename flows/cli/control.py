@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import COLLECT, JsonOption, RigOption, StoreArgument, StoreOption
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import Ask, Requester
 from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
 
@@ -30,16 +32,8 @@ _SHOWN = "%a %Y-%m-%d %H:%M %Z"
 TrialsArgument = Annotated[
     list[str], typer.Argument(help="Trial ids, as listed by `sliplab plan --json`.")
 ]
-WhyOption = Annotated[str, typer.Option("--why", help="The reason, stored with the request.")]
 NeededWhyOption = Annotated[
     str, typer.Option("--why", help="The reason, stored with the trial.", show_default=False)
-]
-WhoOption = Annotated[str, typer.Option("--who", help="Your name; default: the login name.")]
-WaitOption = Annotated[
-    float,
-    typer.Option(
-        "--wait", min=0, max=86400, help="Maximum wait until the request is carried out, s."
-    ),
 ]
 CampaignOption = Annotated[
     str | None, typer.Option("--campaign", help="The campaign, if several contain the trials.")
@@ -47,39 +41,36 @@ CampaignOption = Annotated[
 
 
 @app.command(rich_help_panel=COLLECT, epilog="Example: sliplab pause my-store")
+@model_options
 def pause(
     store: StoreArgument,
-    why: WhyOption = "",
-    who: WhoOption = "",
-    wait: WaitOption = 600.0,
+    wanted: Ask,
     as_json: JsonOption = False,
 ) -> None:
     """Pause after the current trial; returns once the collection is paused."""
-    outcome = _request(store, "pause", who, why, wait)
+    outcome = _request(store, "pause", wanted)
     _finish([outcome], as_json, _pause_words(store, outcome))
 
 
 @app.command(rich_help_panel=COLLECT, epilog="Example: sliplab resume my-store")
+@model_options
 def resume(
     store: StoreArgument,
-    why: WhyOption = "",
-    who: WhoOption = "",
-    wait: WaitOption = 60.0,
+    wanted: Ask = Ask(wait_s=60.0),
     as_json: JsonOption = False,
 ) -> None:
     """Resume a paused collection."""
-    outcome = _request(store, "resume", who, why, wait)
+    outcome = _request(store, "resume", wanted)
     running = outcome.answer is not None and outcome.answer["did"].get("running")
     words = f"{store} is no longer paused" + ("; the collection continues" if running else "")
     _finish([outcome], as_json, words)
 
 
 @app.command(rich_help_panel=COLLECT, epilog="Example: sliplab stop my-store")
+@model_options
 def stop(
     store: StoreArgument,
-    why: WhyOption = "",
-    who: WhoOption = "",
-    wait: WaitOption = 60.0,
+    wanted: Ask = Ask(wait_s=60.0),
     as_json: JsonOption = False,
 ) -> None:
     """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
@@ -90,7 +81,7 @@ def stop(
     halted = halt(store)  # before anything that takes long to load
     from sliplab.flows.collecting import requests
 
-    outcome = requests.note_stop(opened, *halted, who=who, why=why, limit_s=wait)
+    outcome = requests.note_stop(opened, *halted, **wanted.arguments())
     words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
     _finish([outcome], as_json, words)
 
@@ -99,41 +90,41 @@ def stop(
     rich_help_panel=COLLECT,
     epilog='Example: sliplab skip my-store TRIAL --why "the tip was worn"',
 )
+@model_options
 def skip(
     store: StoreArgument,
     trials: TrialsArgument,
     why: NeededWhyOption,
     campaign: CampaignOption = None,
-    who: WhoOption = "",
-    wait: WaitOption = 600.0,
+    requester: Requester = Requester(),
     as_json: JsonOption = False,
 ) -> None:
     """Skip trials: they are not collected until `sliplab again` requests them."""
-    _decide(store, "skip", trials, campaign, who, why, wait, as_json)
+    _decide(store, "skip", trials, campaign, why, requester, as_json)
 
 
 @app.command(
     rich_help_panel=COLLECT,
     epilog='Example: sliplab again my-store TRIAL --why "the plate was dirty"',
 )
+@model_options
 def again(
     store: StoreArgument,
     trials: TrialsArgument,
     why: NeededWhyOption,
     campaign: CampaignOption = None,
-    who: WhoOption = "",
-    wait: WaitOption = 600.0,
+    requester: Requester = Requester(),
     as_json: JsonOption = False,
 ) -> None:
     """Retake trials: the committed recording is moved to quarantine, never deleted."""
-    _decide(store, "again", trials, campaign, who, why, wait, as_json)
+    _decide(store, "again", trials, campaign, why, requester, as_json)
 
 
-def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> RequestOutcome:
+def _request(store: Path, kind: Kind, wanted: Ask) -> RequestOutcome:
     from sliplab.flows.collecting import requests
     from sliplab.storage.trials.store import Store
 
-    return requests.ask(Store.open(store), kind, who=who, why=why, limit_s=wait)
+    return requests.ask(Store.open(store), kind, **wanted.arguments())
 
 
 def _decide(
@@ -141,9 +132,8 @@ def _decide(
     kind: Kind,
     trials: list[str],
     campaign: str | None,
-    who: str,
     why: str,
-    wait: float,
+    requester: Requester,
     as_json: bool,
 ) -> None:
     from sliplab.flows.collecting import requests
@@ -155,7 +145,7 @@ def _decide(
     opened = Store.open(store)
     by_campaign = requests.known_trials(opened, [campaign] if campaign else None, trials)
     outcomes = [
-        requests.ask(opened, kind, who=who, why=why, campaign=name, trials=ids, limit_s=wait)
+        requests.ask(opened, kind, why=why, campaign=name, trials=ids, **requester.arguments())
         for name, ids in by_campaign.items()
     ]
     lines = [

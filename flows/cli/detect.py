@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, RigOption
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import Rule
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 
@@ -23,6 +25,7 @@ app = typer.Typer()
     rich_help_panel=ANALYSE,
     epilog="Example: sliplab detect --rig mock --model my-store/models/seed0.pt --protocol pilot",
 )
+@model_options
 def detect(
     rig: RigOption,
     model: Annotated[
@@ -72,14 +75,7 @@ def detect(
             help="Time between windows, ms; default: the window length.",
         ),
     ] = None,
-    margin: Annotated[
-        float | None,
-        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
-    ] = None,
-    smoothing: Annotated[
-        int | None,
-        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
-    ] = None,
+    rule: Rule = Rule(),
     poll: Annotated[
         float, typer.Option("--poll", min=1, max=200, help="Polling period of the streams, ms.")
     ] = 5.0,
@@ -92,7 +88,7 @@ def detect(
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detecting.request import make_detect_request
 
-    chosen = _chosen(model, detector, stride, (margin, smoothing))
+    chosen = _chosen(model, detector, stride, rule)
     order = make_detect_request(
         rig,
         chosen.model,
@@ -103,8 +99,7 @@ def detect(
         hold_s=hold,
         seconds=seconds,
         stride_ms=stride if chosen.stride_ms is None else chosen.stride_ms,
-        margin=margin,
-        smoothing=smoothing,
+        **rule.model_dump(),
         poll_s=poll / 1000,
         detector=chosen.detector,
     )
@@ -118,9 +113,7 @@ def detect(
         raise typer.Exit(exit_codes.INTERRUPTED)
 
 
-def _chosen(
-    model: Path, detector: str, stride: float | None, rule: tuple[float | None, int | None]
-) -> Chosen:
+def _chosen(model: Path, detector: str, stride: float | None, rule: Rule) -> Chosen:
     """Return a detector of a store, or a network with the rule.
 
     Raises:
@@ -142,7 +135,7 @@ def _chosen(
         return Chosen(model)
     found = detectors_of(model, [detector])[detector]
     if found.detector is not None:
-        given = (("--stride", stride), ("--margin", rule[0]), ("--smoothing", rule[1]))
+        given = (("--stride", stride), ("--margin", rule.margin), ("--smoothing", rule.smoothing))
         for name, value in given:
             if value is not None:
                 right = f"is of the rule; '{detector}' has the stride and level of its validation"

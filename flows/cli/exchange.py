@@ -7,20 +7,13 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import (
-    DATA,
-    FAULTS,
-    JsonOption,
-    StoreOption,
-    finish,
-    new_store,
-    say_faults,
-)
+from sliplab.flows.cli.common import DATA, JsonOption, StoreOption, finish
 from sliplab.flows.running import console, exit_codes
-from sliplab.protocols.errors import InputError
-from sliplab.protocols.shown import one_of
+from sliplab.storage.streams import Json
 
 app = typer.Typer()
+
+_SHOWN = 10
 
 
 @app.command(
@@ -68,60 +61,59 @@ def import_(
     labels and factors, from a folder or .zip, as a campaign to train and evaluate on
     (docs/adapters.md).
     """
-    if adapter is not None:
-        for option, given in (("KIND", path is not None), ("--simulated", simulated)):
-            if given:
-                raise InputError(option, "", None, "cannot be given with --adapter")
-        from sliplab.flows.cli.adapted import import_by_adapter
+    from sliplab.flows.imports import import_data
 
-        import_by_adapter(
-            adapter,
-            Path(kind_or_path),
-            store,
-            name,
-            salvage=salvage,
-            dry_run=dry_run,
-            as_json=as_json,
-        )
-        return
-    if dry_run:
-        raise InputError("--dry-run", "", None, "is for an import with --adapter")
-    if name is None:
-        raise InputError("--name", "", None, "is missing: the name of the new campaign")
-    from dataclasses import replace
-
-    from sliplab.flows.collecting.requests import store_lock
-    from sliplab.storage.files import safe_name
-    from sliplab.storage.formats.import_trials import import_trials
-    from sliplab.storage.formats.known import format_names
-    from sliplab.storage.formats.recognition import entered, kind_of, skipped_in, trials_in
-    from sliplab.storage.trials.store import StoreError
-
-    where = entered(Path(kind_or_path) if path is None else path)
-    kind = kind_of(where) if path is None else kind_or_path
-    if path is not None and kind not in format_names():
-        raise InputError("KIND", "", kind, one_of(kind, format_names()))
-    try:
-        safe_name(name)
-    except StoreError as error:
-        raise InputError("--name", "", name, str(error)) from None
-    skipped = skipped_in(where, kind)
-    found = trials_in(where, kind, salvage=salvage)
-    if simulated:
-        found = (replace(trial, simulated=True) for trial in found)
-    with new_store(store) as opened, store_lock(opened):
-        result = import_trials(
-            opened, name, found, where, kind, lambda trial: console.say(trial), salvage=salvage
-        )
-    say_faults(result)
-    for item in skipped:
-        console.say(f"skipped: {item.file}: {item.reason}")
-    if skipped:
-        result["skipped"] = [vars(item) for item in skipped]
+    source = Path(kind_or_path) if path is None else path
+    result = import_data(
+        source,
+        store,
+        kind=None if path is None else kind_or_path,
+        name=name,
+        adapter=adapter,
+        dry_run=dry_run,
+        simulated=simulated,
+        salvage=salvage,
+    )
     failed = "failed" in result
-    if not as_json:
-        for key in (*FAULTS, "skipped"):
-            result.pop(key, None)
-    finish(result, f"imported into {store}", as_json)
+    title = f"{result['campaign']}: nothing was written" if dry_run else f"imported into {store}"
+    if as_json:
+        finish(result, title, True)
+    else:
+        _show(result, title, f"trials of {source}" if dry_run else "")
     if failed:
         raise typer.Exit(exit_codes.FAILED)
+
+
+def _show(result: Json, title: str, planned: str) -> None:
+    """Print the result of an import for a person; its faults were printed when they were found.
+
+    Args:
+        planned: title of the table of what would be imported; empty after an import.
+    """
+    skipped, split = result.pop("skipped", []), result.pop("split", None)
+    for key in ("warnings", "salvaged", "left_out", "failed"):
+        result.pop(key, None)
+    if planned:
+        rows = result["trials"]
+        cells = [
+            (
+                row["trial"],
+                ", ".join(f"{factor} {level}" for factor, level in row["condition"].items()) or "-",
+                row["label"] or "-",
+                row["part"],
+                "yes" if row["there"] else "no",
+            )
+            for row in rows
+        ]
+        columns = ("trial", "condition", "label", "part", "there")
+        console.print_table(planned, columns, cells, limit=4 * _SHOWN)
+        result["trials"] = len(rows)
+    if split is not None:  # a data set by an adapter, which may skip thousands of files
+        for item in skipped[:_SHOWN]:
+            console.say(f"skipped: {item['file']}: {item['reason']}")
+        if len(skipped) > _SHOWN:
+            console.say(f"skipped: {len(skipped) - _SHOWN} more; --json lists all")
+        result |= {key: len(result[key]) for key in ("imported", "there") if key in result}
+        parts = ", ".join(f"{count} {part}" for part, count in split.items())
+        result |= {"split": parts, "skipped": len(skipped)}
+    finish(result, title, False)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import Field
 
-from sliplab.flows.cli.common import DATA, JsonOption, finish, located
+from sliplab.flows.cli.common import DATA, JsonOption, finish
+from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import StrictModel
 
 if TYPE_CHECKING:
     from sliplab.flows.exports import ExportRequest
@@ -18,9 +20,34 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
+class ExportOptions(StrictModel):
+    """Options of the forms; each form takes some of them."""
+
+    campaign: list[str] = Field(
+        default=[], description="Store, model: only this campaign. Repeatable."
+    )
+    title: str | None = Field(
+        default=None, description="Store: title; default: the campaigns' names."
+    )
+    creator: list[str] = Field(default=[], description="Store: name of an author. Repeatable.")
+    licence: str | None = Field(
+        default=None, description="Store: SPDX id of the licence, such as CC-BY-4.0."
+    )
+    stream: str | None = Field(
+        default=None, description="Trials: a further event camera's stream, by its name."
+    )
+    store: Path | None = Field(
+        default=None, description="Model: store of the test windows; default: the model's own."
+    )
+    windows: int | None = Field(
+        default=None, ge=1, le=1_000_000, description="Model: windows to check ONNX on (256)."
+    )
+
+
 @app.command(
     rich_help_panel=DATA, epilog="Example: sliplab export my-store my-campaign --as dsec -o out"
 )
+@model_options
 def export(
     place: Annotated[
         str, typer.Argument(metavar="WHAT", help="A store's folder or URL, or a model's file.")
@@ -42,34 +69,7 @@ def export(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to write, or file for labels.")
     ] = ...,  # type: ignore[assignment]  # typer's word for: must be given
-    campaign: Annotated[
-        list[str] | None,
-        typer.Option("--campaign", help="Store, model: only this campaign. Repeatable."),
-    ] = None,
-    title: Annotated[
-        str | None, typer.Option("--title", help="Store: title; default: the campaigns' names.")
-    ] = None,
-    creator: Annotated[
-        list[str] | None, typer.Option("--creator", help="Store: name of an author. Repeatable.")
-    ] = None,
-    licence: Annotated[
-        str | None,
-        typer.Option("--licence", help="Store: SPDX id of the licence, such as CC-BY-4.0."),
-    ] = None,
-    stream: Annotated[
-        str | None,
-        typer.Option("--stream", help="Trials: a further event camera's stream, by its name."),
-    ] = None,
-    store: Annotated[
-        Path | None,
-        typer.Option("--store", help="Model: store of the test windows; default: the model's own."),
-    ] = None,
-    windows: Annotated[
-        int | None,
-        typer.Option(
-            "--windows", min=1, max=1_000_000, help="Model: windows to check ONNX on (256)."
-        ),
-    ] = None,
+    options: ExportOptions = ExportOptions(),
     old_form: Annotated[str | None, typer.Option("--format", hidden=True)] = None,
     old_labels: Annotated[bool, typer.Option("--labels", hidden=True)] = False,
     as_json: JsonOption = False,
@@ -85,27 +85,15 @@ def export(
         )
     if form is None:
         raise InputError("--as", "", None, f"is needed: {fitting_forms(place)}")
-    given = {
-        "campaign": campaign,
-        "title": title,
-        "creator": creator,
-        "licence": licence,
-        "stream": stream,
-        "store": store,
-        "windows": windows,
-    }
-    options = {name: value for name, value in given.items() if value is not None}
-    write(ExportRequest(place, part, form, output, options), as_json)
+    given = options.model_dump(exclude_unset=True)
+    write(ExportRequest(place, part, form, output, given), as_json)
 
 
 def write(request: ExportRequest, as_json: bool) -> None:
     """Run an export and print its result."""
-    from sliplab.flows.exports import check_export
+    from sliplab.flows.exports import export as run
 
-    form = check_export(request)
-    if form.of != "model":
-        request = replace(request, place=str(located(request.place)))
-    done = form.write(request)
+    done = run(request)
     finish(done.result if as_json or done.pairs is None else done.pairs, done.title, as_json)
 
 

@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import typer
+from pydantic import Field
 
 from sliplab.flows.cli.common import RIG, JsonOption, RigOption
+from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import StrictModel
 
 if TYPE_CHECKING:
     from sliplab.flows.calibrating.measurement import CalibrationSession, MeasurementResult
-    from sliplab.rigs.core.teaching import Creep
     from sliplab.rigs.rig_file import RigFile
 
 app = typer.Typer()
@@ -35,31 +37,36 @@ YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before the ar
 DryOption = Annotated[
     bool, typer.Option("--dry-run", help="Print the planned motions without moving anything.")
 ]
-SpeedOption = Annotated[
-    float, typer.Option("--speed", min=0.01, max=1.0, help="Approach speed near contact, mm/s.")
-]
-SearchOption = Annotated[
-    float,
-    typer.Option(
-        "--search", min=0.1, max=50, help="Hard limit of travel beyond the assumed plane, mm."
-    ),
-]
-ClearanceOption = Annotated[
-    float,
-    typer.Option(
-        "--clearance",
-        min=0.5,
-        max=50,
-        help="Distance before the plane at which the slow approach begins, mm.",
-    ),
-]
-SquareOption = Annotated[
-    float, typer.Option("--square", min=0.5, max=50, help="Measured side of a printed square, mm.")
-]
-ColumnsOption = Annotated[
-    int, typer.Option("--columns", min=0, max=1000, help="Board squares across.")
-]
-RowsOption = Annotated[int, typer.Option("--rows", min=0, max=1000, help="Board squares down.")]
+
+
+class CreepOptions(StrictModel):
+    """The search for a touch."""
+
+    speed_mm_s: float = Field(
+        default=0.5, ge=0.01, le=1.0, description="Approach speed near contact, mm/s."
+    )
+    search_mm: float = Field(
+        default=2.0,
+        ge=0.1,
+        le=50,
+        description="Hard limit of travel beyond the assumed plane, mm.",
+    )
+    clearance_mm: float = Field(
+        default=3.0,
+        ge=0.5,
+        le=50,
+        description="Distance before the plane at which the slow approach begins, mm.",
+    )
+
+
+class BoardOptions(StrictModel):
+    """A ChArUco board."""
+
+    square_mm: float = Field(
+        default=6.0, ge=0.5, le=50, description="Measured side of a printed square, mm."
+    )
+    columns: int = Field(default=11, ge=0, le=1000, description="Board squares across.")
+    rows: int = Field(default=7, ge=0, le=1000, description="Board squares down.")
 
 
 COLUMNS = {"name": "name", "driver": "driver", "arm": "arm", "cameras": "cameras", "answer": "says"}
@@ -236,6 +243,7 @@ class ZeroBy(StrEnum):
 
 
 @teach_app.command("plane", epilog="Example: sliplab teach plane --rig my-rig.yaml")
+@model_options
 def teach_plane(
     rig: RigOption,
     by: Annotated[
@@ -250,9 +258,7 @@ def teach_plane(
     repeats: Annotated[
         int, typer.Option("--repeats", min=1, max=20, help="Touches per point.")
     ] = 2,
-    speed: SpeedOption = 0.5,
-    search: SearchOption = 2.0,
-    clearance: ClearanceOption = 3.0,
+    options: CreepOptions = CreepOptions(),
     out: OutOption = None,
     yes: YesOption = False,
     dry_run: DryOption = False,
@@ -261,12 +267,13 @@ def teach_plane(
     """Find the contact plane from three touches, and check it with a fourth."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
+    from sliplab.rigs.core.teaching import Creep
 
     command = Measurement(rig, out, "plane", as_json)
     if by is By.HAND:
         command.run([], yes, dry_run, steps.teach_plane_by_hand, "a person jogs the arm")
         return
-    creep = _creep_settings(speed, search, clearance)
+    creep = Creep(**options.model_dump())
     steps.check_touches(command.file, "plane", span, creep)
     places = list(steps.plane_places(span).items())
     moves = steps.planned_touches(places, creep)
@@ -276,6 +283,7 @@ def teach_plane(
 
 
 @teach_app.command("zero", epilog="Example: sliplab teach zero --rig my-rig.yaml")
+@model_options
 def teach_zero(
     rig: RigOption,
     by: Annotated[ZeroBy, typer.Option("--by", help="Events and markers, or events alone.")] = (
@@ -284,9 +292,7 @@ def teach_zero(
     repeats: Annotated[
         int, typer.Option("--repeats", min=1, max=50, help="Number of touches.")
     ] = 3,
-    speed: SpeedOption = 0.5,
-    search: SearchOption = 2.0,
-    clearance: ClearanceOption = 3.0,
+    options: CreepOptions = CreepOptions(),
     out: OutOption = None,
     yes: YesOption = False,
     dry_run: DryOption = False,
@@ -295,9 +301,10 @@ def teach_zero(
     """Find depth zero from touches at the centre, observed by both cameras."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
+    from sliplab.rigs.core.teaching import Creep
 
     command = Measurement(rig, out, "zero", as_json)
-    creep = _creep_settings(speed, search, clearance)
+    creep = Creep(**options.model_dump())
     steps.check_touches(command.file, "zero", 0.0, creep)
     both = by is ZeroBy.BOTH
     moves = steps.planned_zero(creep, both)
@@ -340,6 +347,7 @@ def teach_tool(
 
 
 @calibrate_app.command("lens", epilog="Example: sliplab calibrate lens --rig my-rig.yaml")
+@model_options
 def calibrate_lens(
     rig: RigOption,
     views: Annotated[int, typer.Option("--views", min=4, max=60, help="Images to take.")] = 8,
@@ -349,9 +357,7 @@ def calibrate_lens(
             "--images", help="Use the images of this folder; the first shows the board flat."
         ),
     ] = None,
-    square: SquareOption = 6.0,
-    columns: ColumnsOption = 11,
-    rows: RowsOption = 7,
+    options: BoardOptions = BoardOptions(),
     out: OutOption = None,
     dry_run: DryOption = False,
     as_json: JsonOption = False,
@@ -360,7 +366,7 @@ def calibrate_lens(
     from sliplab.flows.calibrating import calibrate as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
-    board = _board(columns, rows, square)
+    board = _board(options)
     command = Measurement(rig, out, "lens", as_json)
 
     def measure(session: CalibrationSession) -> MeasurementResult:
@@ -404,31 +410,24 @@ def calibrate_crop(
 
 
 @calibrate_app.command("board", epilog="Example: sliplab calibrate board --out board.pdf")
+@model_options
 def calibrate_board(
     out: Annotated[Path, typer.Option("--out", help="Output file, .pdf or .png.")] = Path(
         "sliplab-board.pdf"
     ),
-    square: SquareOption = 6.0,
-    columns: ColumnsOption = 11,
-    rows: RowsOption = 7,
+    options: BoardOptions = BoardOptions(),
     as_json: JsonOption = False,
 ) -> None:
     """Write the calibration board to print, with a ruler to check its size."""
     from sliplab.flows.calibrating.calibrate import print_board
 
-    board = _board(columns, rows, square)
+    board = _board(options)
     sizes = print_board(board, out)
     if as_json:
         console.print_json({"board": str(out), **sizes})
         return
     console.print_pairs(f"board {out}", sizes)
     console.say("print at 100 %, measure the ruler, and fix the sheet to something flat")
-
-
-def _creep_settings(speed: float, search: float, clearance: float) -> Creep:
-    from sliplab.rigs.core.teaching import Creep
-
-    return Creep(speed, search, clearance)
 
 
 def _tool(text: str) -> Any:
@@ -444,10 +443,11 @@ def _tool(text: str) -> Any:
     return Pose((x, y, z), (a, b, c))
 
 
-def _board(columns: int, rows: int, square: float) -> Any:
+def _board(options: BoardOptions) -> Any:
     from sliplab.analysis.calibration.charuco import Board, BoardError
 
+    columns, rows, square_mm = options.columns, options.rows, options.square_mm
     try:
-        return Board(columns, rows, square, 0.75 * square)
+        return Board(columns, rows, square_mm, 0.75 * square_mm)
     except BoardError as error:
         raise InputError("--columns", "", f"{columns} x {rows}", str(error)) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -15,12 +15,12 @@ from sliplab.flows.cli.common import (
     JsonOption,
     PlaceArgument,
     finish,
-    located,
     step,
 )
+from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.planning.parameters import Rule
 from sliplab.flows.running import console
-from sliplab.flows.steps import run_step
-from sliplab.protocols.errors import InputError
+from sliplab.flows.steps import located, run_step
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
@@ -90,17 +90,11 @@ def train(
 
 
 @app.command(rich_help_panel=ANALYSE, epilog="Example: sliplab evaluate my-store")
+@model_options
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
-    margin: Annotated[
-        float | None,
-        typer.Option("--margin", min=0, max=1e6, help="Spikes by which the winner must lead."),
-    ] = None,
-    smoothing: Annotated[
-        int | None,
-        typer.Option("--smoothing", min=1, max=1000, help="Number of windows to average."),
-    ] = None,
+    rule: Rule = Rule(),
     reviewed: ReviewedOption = False,
     baselines: Annotated[
         bool,
@@ -123,32 +117,39 @@ def evaluate(
             "--engine", help="Engine for --model; default: fast where its counts equal Sinabs'."
         ),
     ] = None,
+    predictions: Annotated[
+        Path | None,
+        typer.Option(
+            "--predictions",
+            help="Score any model by its predictions of the test windows: a .csv or .parquet "
+            "table (docs/models.md).",
+        ),
+    ] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on the test trials."""
-    options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
-    if model is None and engine is not None:
-        raise InputError("--engine", "", engine.value, "belongs to --model")
-    folder = located(store)
-    if model is not None:
-        for name, chosen in (("--baselines", baselines), ("--checks", checks)):
-            if chosen:
-                raise InputError(name, "", None, "applies only to the store's own network")
-        options |= {"model": model, "engine": None if engine is None else engine.value}
-        scores = cast("NetworkScores", run_step(folder, campaign, "judge_model", dask, **options))
-        if as_json:
-            console.print_json(scores)
-        else:
-            simulated = " (simulated)" if scores["simulated"] else ""
-            console.print_pairs(f"{scores['model']} on {store}{simulated}", _model_scores(scores))
+    from sliplab.flows.evaluations import run_evaluation
+
+    done = run_evaluation(
+        located(store),
+        campaign,
+        margin=rule.margin,
+        smoothing=rule.smoothing,
+        reviewed=reviewed,
+        baselines=baselines,
+        checks=checks,
+        model=model,
+        engine=None if engine is None else engine.value,
+        predictions=predictions,
+        dask=dask,
+    )
+    if as_json or (model is None and predictions is None):
+        finish(done, f"evaluate {store}", as_json)
         return
-    done: dict[str, object] = {**run_step(folder, campaign, "evaluate", dask, **options)}
-    more = {"window_baselines": baselines, "window_checks": checks}
-    for name, chosen in more.items():
-        if chosen:
-            done[name] = run_step(folder, campaign, name, reviewed=reviewed)
-    finish(done, f"evaluate {store}", as_json)
+    scores = cast("NetworkScores", done)
+    simulated = " (simulated)" if scores["simulated"] else ""
+    console.print_pairs(f"{scores['model']} on {store}{simulated}", _model_scores(scores))
 
 
 def _model_scores(result: NetworkScores) -> dict[str, str | int]:

@@ -14,9 +14,9 @@ from sliplab.flows.cli.common import (
     JsonOption,
     PlaceArgument,
     StoreArgument,
-    located,
 )
 from sliplab.flows.running import console, exit_codes
+from sliplab.flows.steps import located
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, plural
 
@@ -110,62 +110,26 @@ def verify(
 
     Unfinished trials, and the one that is being recorded, are named and are no damage.
     """
-    from sliplab.storage.remote.objects import is_url
-    from sliplab.storage.trials.store import Store
-    from sliplab.storage.trials.verify import (
-        DAMAGED,
-        failed_gates,
-        quarantine_damaged,
-        salvaged,
-        trial_folders,
-    )
-    from sliplab.storage.trials.verify import verify as look
+    from sliplab.flows.verify import verify as run
+    from sliplab.storage.trials.verify import DAMAGED
 
-    if is_url(store):
-        _verify_pushed(store, quarantine, as_json)
-        return
-    opened = Store.open(Path(store))
-    total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
-    with console.bar("verify (trials)", total) as bar:
-        mended: list[Path] = []
-        problems = look(opened, lambda name: bar.advance(1, name), mended.append)
-    for path in mended:
-        console.say(f"{path}: another program had left it open for writing; as committed again")
+    found = run(store, quarantine)
+    problems = found["problems"]
     wrong = [item for item in problems if item.kind == DAMAGED]
-    moved: list[str] = []
-    if quarantine and any(item.trial for item in problems):
-        from sliplab.flows.collecting.requests import store_lock
-
-        with store_lock(opened):
-            moved = quarantine_damaged(opened, problems)
+    for path in found.get("mended", ()):
+        console.say(f"{path}: another program had left it open for writing; as committed again")
+    if moved := found.get("quarantined"):
         console.say(
             f"{plural(len(moved), 'damaged trial')} quarantined; `sliplab collect` retakes them"
         )
-    torn = salvaged(opened)
-    for trial in torn:
+    for trial in found.get("salvaged", ()):
         console.say(f"{trial}: was salvaged from a damaged file: intact, but not all of it")
-    failing = failed_gates(opened)
-    for trial, gates in failing.items():
+    for trial, gates in found.get("failed_gates", {}).items():
         console.say(
             f"{trial}: does not pass {', '.join(gates)}: intact, but not used by later steps"
         )
     if as_json:
-        damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
-        result = {
-            "trials": total,
-            "whole": total - damaged,
-            "damaged": damaged,
-            "format": opened.format,
-            "ok": not wrong,
-            "problems": [vars(item) for item in problems],
-            "quarantined": moved,
-        }
-        further = {
-            "mended": [str(path) for path in mended],
-            "salvaged": torn,
-            "failed_gates": failing,
-        }
-        console.print_json(result | {key: found for key, found in further.items() if found})
+        console.print_json(found)
     else:
         for item in problems:
             if item.kind != DAMAGED:
@@ -174,7 +138,7 @@ def verify(
             rows = [[item.path, item.what] for item in wrong]
             console.print_table(plural(len(wrong), "problem"), ["where", "what is wrong"], rows)
         else:
-            console.show(f"{plural(total, 'trial')}, all intact")
+            console.show(f"{plural(found['trials'], 'trial')}, all intact")
     if wrong:
         raise typer.Exit(exit_codes.FAILED)
 
@@ -304,52 +268,6 @@ def pull(
             on_bytes=lambda _: bar.advance(0),
         )
     _finish({"url": url, "store": str(store), **vars(done)}, "pull", as_json)
-
-
-def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
-    """Verify a pushed store at a URL by reading all of it.
-
-    Raises:
-        InputError: `quarantine` was given; a URL has none.
-    """
-    from sliplab.flows.running import stopping
-    from sliplab.storage.remote.objects import Remote
-    from sliplab.storage.remote.verify import verify_remote
-
-    if quarantine:
-        raise InputError(
-            "--quarantine",
-            "",
-            url,
-            "must not be given with a URL: `sliplab push --check` from a "
-            "whole store replaces what is damaged there",
-        )
-    with console.bar(f"verify {url} (trials)", 0) as bar:
-
-        def seen(name: str) -> None:
-            bar.extend(1)
-            bar.advance(1, name)
-
-        trials, problems = verify_remote(Remote(url), seen, lambda _: stopping.check())
-    damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
-    if as_json:
-        console.print_json(
-            {
-                "url": url,
-                "trials": trials,
-                "whole": trials - damaged,
-                "damaged": damaged,
-                "ok": not problems,
-                "problems": [vars(item) for item in problems],
-            }
-        )
-    elif problems:
-        rows = [[item.path, item.what] for item in problems]
-        console.print_table(plural(len(problems), "problem"), ["where", "what is wrong"], rows)
-    else:
-        console.show(f"{plural(trials, 'trial')}, all intact")
-    if problems:
-        raise typer.Exit(exit_codes.FAILED)
 
 
 def _chosen(store: Store, names: list[str] | None) -> list[Campaign]:

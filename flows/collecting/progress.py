@@ -1,5 +1,6 @@
 """Progress of a collection: time left, the console's bar, and Prefect's page.
 
+The run's page has its name, a line for each trial, how many are done, and who paused it and why.
 A separate thread reports to the server, every few seconds at most, so that neither a batch of
 quick trials nor a slow server delays a trial. Failed reports are dropped: the page is only a
 view of the store.
@@ -9,14 +10,17 @@ from __future__ import annotations
 
 import base64
 import contextvars
+import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
+from sliplab.flows.collecting.supervisor import SessionListener
 from sliplab.flows.planning.run_request import CampaignCounts, RunRequest
 from sliplab.flows.running import console, orchestration, stopping
 from sliplab.protocols import Plan, Trial
@@ -35,6 +39,8 @@ ANSWER_S = 5.0
 LOST_AFTER = 3
 """Number of unanswered reports after which the server counts as lost."""
 MOST_POINTS = 300
+MOST_LINES = 5000
+"""Lines that wait for a server that does not answer."""
 
 
 class Remaining:
@@ -86,19 +92,26 @@ class Remaining:
         return "" if seconds is None else f"{console.duration(max(seconds, 0.0))} left"
 
 
-class CollectionProgress:
+class CollectionProgress(SessionListener):
     """Progress of one collection: trials by outcome, and the time left.
 
     It is shown as a bar on the console, and read by the thread that reports to Prefect's page.
 
     Args:
         on_begin: called when the rig is ours and trials are about to be taken.
+
+    Attributes:
+        title: names the collection: its campaign, rig and number of trials.
+        paused: why it is paused; empty if it is not.
+        lines: of its log, with their times; the oldest that the page lacks come first.
     """
 
     def __init__(self, run_request: RunRequest, on_begin: Callable[[], None]) -> None:
         self._run_request, self._on_begin = run_request, on_begin
         self._total = self._done = 0
         self.outcomes: Counter[str] = Counter()
+        self.title = self.paused = ""
+        self.lines: deque[tuple[datetime, str]] = deque(maxlen=MOST_LINES)
         self._lock = threading.Lock()
         self._bar: console.ProgressBar
         self._left: Remaining
@@ -108,12 +121,20 @@ class CollectionProgress:
         """Show the progress of taking `trials` while the block runs."""
         rig = self._run_request.rig
         self._total = len(trials)
+        simulated = "simulated " if rig.simulated else ""
+        campaign, count = self._run_request.campaign, plural(len(trials), f"{simulated}trial")
+        self.title = f"collect {campaign} on {rig.name}, {count}"
         self._on_begin()
         self._left = Remaining(self._run_request.plan, trials, real_time=not rig.in_virtual_time)
-        simulated = "simulated " if rig.simulated else ""
-        title = f"collect {self._run_request.campaign} ({simulated}trials)"
-        with console.bar(title, len(trials), str(self._left)) as self._bar:
+        title = f"collect {campaign} ({simulated}trials)"
+        with (
+            console.lines_to(self._log),
+            console.bar(title, len(trials), str(self._left)) as self._bar,
+        ):
             yield
+
+    def _log(self, line: str) -> None:
+        self.lines.append((datetime.now(UTC), line))
 
     def add(self, trials: Sequence[Trial]) -> None:
         """Add trials that are to be taken as well."""
@@ -132,10 +153,16 @@ class CollectionProgress:
             self._done += 1
             self.outcomes[outcome] += 1
         self._left.done(trial)
+        self._log(f"{trial.id} {outcome}")
         self._bar.advance(1, f"{trial.id} {outcome}", str(self._left))
 
-    def on_pause(self, seconds: float) -> None:
+    def on_paused(self, why: str) -> None:
+        """Show a pause."""
+        self.paused = why
+
+    def on_resumed(self, seconds: float) -> None:
         """Leave the time of a pause out of the estimate."""
+        self.paused = ""
         self._left.pause(seconds)
 
     @property
@@ -172,6 +199,8 @@ class _Page:
         self._run_request, self._run = run_request, run
         self._over = threading.Event()
         self._artifact: Any = None
+        self._summary: tuple[float, str] | None = None
+        self._paused = ""
         self._misses = 0
         self._public = not orchestration.uses_private_server()
         settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
@@ -198,15 +227,14 @@ class _Page:
             get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
         ):
             self._answered(self._rig, client, True)
-            before = None
+            self._answered(self._report_name, client)
             while not self._over.wait(PERIOD_S):
-                if (now := self.progress.summary) != before and self._answered(
-                    self._report_progress, client
-                ):
-                    before = now
+                for report in (self._report_lines, self._report_pause, self._report_progress):
+                    self._answered(report, client)
             # the rig is free before the figure, which takes longest, is drawn
             public = [lambda client: self._rig(client, False), self._report_figure]
-            last = [self._report_progress, self._report_table, *(public if self._public else ())]
+            last = [self._report_lines, self._report_progress, self._report_table]
+            last += public if self._public else []
             for report in last:
                 try:
                     report(client)
@@ -216,31 +244,51 @@ class _Page:
                 except Exception:
                     continue
 
-    def _answered(self, report: Callable[..., None], *about: Any) -> bool:
-        """Return whether the server took a report; after `LOST_AFTER` failures it is lost."""
+    def _answered(self, report: Callable[..., None], *about: Any) -> None:
+        """Send a report; after `LOST_AFTER` failures in a row the server is lost."""
         try:
             report(*about)
         except Exception as error:
             self._misses += 1
             if self._misses == LOST_AFTER:
                 orchestration.report_unreachable(orchestration.reason_of(error))
-            return False
-        self._misses = 0
-        return True
+        else:
+            self._misses = 0
 
     def _rig(self, client: Any, busy: bool) -> None:
         """Show on a public server whether the rig is in use; the lock is elsewhere."""
         if self._public:
             sign_rig(client, self._run_request.rig.name, busy)
 
+    def _report_name(self, client: Any) -> None:
+        client.update_flow_run(self._run, name=self.progress.title)
+
+    def _report_lines(self, client: Any) -> None:
+        lines = list(self.progress.lines)
+        if lines:
+            about = {"name": "sliplab", "level": logging.INFO, "flow_run_id": str(self._run)}
+            client.create_logs(
+                {**about, "message": line, "timestamp": when.isoformat()} for when, line in lines
+            )
+        for _ in lines:
+            self.progress.lines.popleft()
+
+    def _report_pause(self, client: Any) -> None:
+        if (now := self.progress.paused) != self._paused:
+            orchestration.show_running(client, self._run, "Paused" if now else "Running", now)
+            self._paused = now
+
     def _report_progress(self, client: Any) -> None:
         from prefect.client.schemas.actions import ArtifactUpdate
 
-        percent, words = self.progress.summary
+        if (now := self.progress.summary) == self._summary:
+            return
+        percent, words = now
         if self._artifact is None:
             self._artifact = self._make(client, "progress", percent, words).id
         else:
             client.update_artifact(self._artifact, ArtifactUpdate(data=percent, description=words))
+        self._summary = now
 
     def _report_table(self, client: Any) -> None:
         import json

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.requests import carry_out, store_lock
-from sliplab.flows.collecting.supervisor import CollectionSupervisor
+from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
@@ -93,29 +93,9 @@ class CollectionSession:
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
 
-class SessionListener(Protocol):
-    """Follows a session, such as a progress display."""
-
-    def on_trial_done(self, trial: Trial, outcome: str) -> None:
-        """Take note of a trial that is ``committed``, ``set aside`` or ``skipped``."""
-
-    def on_pause(self, seconds: float) -> None:
-        """Take note of a pause that is over."""
-
-
-class NoListener:
-    """Follows nothing."""
-
-    def on_trial_done(self, trial: Trial, outcome: str) -> None:
-        """Do nothing."""
-
-    def on_pause(self, seconds: float) -> None:
-        """Do nothing."""
-
-
 @contextmanager
 def open_session(
-    run_request: RunRequest, listener: SessionListener | None = None
+    run_request: RunRequest, listener: SessionListener = NO_LISTENER
 ) -> Iterator[CollectionSession]:
     """Open a session for a collection; the rig is closed when the block ends.
 
@@ -124,11 +104,10 @@ def open_session(
         StoreError: its disk is full, read-only or failing.
         CampaignStopped: reference trials had drifted.
     """
-    listener = listener or NoListener()
     store = Store.create(run_request.store)
     with store_lock(store, collects=run_request.campaign):
         campaign = _recover(store, run_request)
-        supervisor = CollectionSupervisor(run_request, store, campaign, on_pause=listener.on_pause)
+        supervisor = CollectionSupervisor(run_request, store, campaign, listener=listener)
         supervisor.begin()
         # the rig is closed before results are computed
         with (
@@ -196,7 +175,7 @@ def clean_up(store: Store) -> None:
     """Delete the temporary files that killed programs left outside the campaigns."""
     sweep_temporary(store.folder)
     sweep_temporary(store.folder / control.FOLDER)
-    for name in ("models", "report", "derived", "review", "pulled"):
+    for name in ("models", "report", "derived", "review", "log", "pulled"):
         folder = store.folder / name
         for path in (folder, *folder.rglob("*")):
             if path.is_dir():
@@ -243,7 +222,7 @@ class TrialCollector:
     rig: Rig
     campaign: Campaign
     operator: str = ""
-    on_trial: Callable[[Trial, str], None] = NoListener().on_trial_done
+    on_trial: Callable[[Trial, str], None] = NO_LISTENER.on_trial_done
     on_commit: Callable[[Trial], None] = _ignore
     supervisor: CollectionSupervisor | None = None
     taken: int = 0

@@ -27,6 +27,22 @@ class WindowOver(CampaignStopped):
     """The time window of the collection is over; the next collection resumes it."""
 
 
+class SessionListener:
+    """Follows a session, such as a progress display; this one does nothing."""
+
+    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+        """Take note of a trial that is ``committed``, ``set aside`` or ``skipped``."""
+
+    def on_paused(self, why: str) -> None:
+        """Take note of a pause: before which trial, who asked for it and why."""
+
+    def on_resumed(self, seconds: float) -> None:
+        """Take note of the end of a pause of some seconds."""
+
+
+NO_LISTENER = SessionListener()
+
+
 class CollectionSupervisor:
     """Decides between two trials whether the next may begin; notified after each.
 
@@ -35,7 +51,7 @@ class CollectionSupervisor:
 
     Attributes:
         wait: waits some seconds, and answers stop requests.
-        on_pause: called with the seconds of a pause when it is over.
+        listener: notified of pauses.
         clock: returns seconds since 1970; decides when the window ends.
     """
 
@@ -45,13 +61,13 @@ class CollectionSupervisor:
         store: Store,
         campaign: Campaign,
         disk: DiskWatch | None = None,
-        on_pause: Callable[[float], None] = lambda seconds: None,
+        listener: SessionListener = NO_LISTENER,
     ) -> None:
         self._run_request, self._store, self._campaign = run_request, store, campaign
         self.disk = DiskWatch(run_request, campaign) if disk is None else disk
         self._references = ReferenceWatch(run_request, campaign)
         self.wait: Callable[[float], None] = stopping.wait
-        self.on_pause = on_pause
+        self.listener = listener
         self.clock: Callable[[], float] = time.time
         self._seen: frozenset[str] = frozenset()
         self._paused: ControlRequest | None = None
@@ -147,10 +163,9 @@ class CollectionSupervisor:
 
     def _wait_while_paused(self, trial: Trial) -> None:
         """Wait until the pause is over."""
-        console.say(
-            f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
-            "continues it"
-        )
+        why = f"paused before {trial.id} ({self._paused})"
+        console.say(f"{why}; `sliplab resume {self._store.folder}` continues it")
+        self.listener.on_paused(why)
         waited = 0.0
         while request := self._process_requests():
             self._check_window(trial)
@@ -163,7 +178,7 @@ class CollectionSupervisor:
             self.wait(POLL_S)
             waited += POLL_S
         console.say("resumed")
-        self.on_pause(waited)
+        self.listener.on_resumed(waited)
         self._was_paused = True
 
     def _names(self) -> frozenset[str]:

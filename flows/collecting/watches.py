@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from decimal import Decimal
 from pathlib import Path
 
-from sliplab.analysis.force import sliding_friction
-from sliplab.analysis.quality import hold_rate
+from sliplab.analysis.references import (
+    ReferenceDrift,
+    compare,
+    reference_figures,
+    reference_trials,
+)
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.flows.planning.estimate import trial_bytes
@@ -19,6 +22,15 @@ from sliplab.storage.trials.store import Campaign
 
 _LOOK_BACK = 50
 """Committed trials from which a session estimates sizes when it begins."""
+_SHOWN = {
+    "event_rate": ("{:,.0f}", "events/s in the hold", "Skin, light or lens changed"),
+    "friction": (
+        "{:.3f}",
+        "N/N of friction in the slide",
+        "Skin worn, or skin or plate dirty",
+    ),
+}
+"""Format, unit and place, and likely causes of a drift, by key of ``gates.reference``."""
 
 
 class DiskWatch:
@@ -78,16 +90,12 @@ class DiskWatch:
 
 
 class ReferenceWatch:
-    """Compares every reference trial with the campaign's first one: event rate, and friction.
-
-    Onsets are not compared: they are unknown until `sliplab label` has read the outside camera's
-    frames.
-    """
+    """Compares every reference trial with the campaign's first one, and stops at a large drift."""
 
     def __init__(self, run_request: RunRequest, campaign: Campaign) -> None:
         self._run_request, self._campaign = run_request, campaign
         self._gate = run_request.plan.protocol.collection.gates.reference
-        self._first: dict[str, tuple[str, float]] = {}
+        self._first: tuple[str, dict[str, float]] | None = None
 
     def begin(self) -> None:
         """Check the last reference trial of earlier sessions.
@@ -97,8 +105,7 @@ class ReferenceWatch:
         """
         if self._gate is None:
             return
-        there = self._campaign.committed()
-        known = [t for t in self._run_request.plan if t.role == "reference" and t.id in there]
+        known = reference_trials(self._run_request.plan, self._campaign.committed())
         for trial in dict.fromkeys([*known[:1], *known[-1:]]):
             self.look(trial)
 
@@ -110,53 +117,21 @@ class ReferenceWatch:
         """
         if self._gate is None or trial.role != "reference":
             return
-        recording = self._campaign.recording(trial.id)
-        self._compare(
-            trial,
-            "event_rate",
-            self._gate.event_rate,
-            hold_rate(recording),
-            "{:,.0f}",
-            "events/s in the hold",
-            "Skin, light or lens changed",
-        )
-        if self._gate.friction is not None:
-            self._compare(
-                trial,
-                "friction",
-                self._gate.friction,
-                sliding_friction(recording),
-                "{:.3f}",
-                "N/N of friction in the slide",
-                "Skin worn, or skin or plate dirty",
-            )
+        found = trial.id, reference_figures(self._campaign.recording(trial.id), self._gate)
+        self._first = self._first or found
+        for drift in compare(self._gate, self._first, found):
+            if drift.beyond:
+                raise CampaignStopped(self._message(drift))
 
-    def _compare(
-        self,
-        trial: Trial,
-        key: str,
-        bound: Decimal,
-        value: float,
-        figure: str,
-        where: str,
-        cause: str,
-    ) -> None:
-        """Compare a figure with that of the first reference trial.
-
-        Args:
-            key: of `gates.reference`. figure: its format. where: unit and place, for people.
-        """
-        first, expected = self._first.setdefault(key, (trial.id, value))
-        drift = 100 * (value / expected - 1) if expected else (100.0 if value else 0.0)
-        if abs(drift) <= float(bound):
-            return
+    def _message(self, drift: ReferenceDrift) -> str:
+        figure, where, cause = _SHOWN[drift.key]
         simulated = "simulated " if self._run_request.rig.simulated else ""
-        raise CampaignStopped(
+        return (
             f"campaign {self._campaign.name}: {simulated}reference trials drifted apart: "
-            f"{trial.id} has {figure.format(value)} {where}, {first} had {figure.format(expected)} "
-            f"({drift:+.1f} %, gates.reference.{key} = {float(bound):g} %). {cause}: see to it, "
-            f"then `sliplab again {self._run_request.store} {trial.id} "
-            f"--why ...` and the same command go on (give {first} as well if the new state is the "
-            "one to compare with). Onsets were not compared: they are known after `sliplab label` "
-            "only"
+            f"{drift.trial} has {figure.format(drift.value)} {where}, {drift.first} had "
+            f"{figure.format(drift.expected)} ({drift.percent:+.1f} %, "
+            f"gates.reference.{drift.key} = {drift.bound_percent:g} %). {cause}: see to it, then "
+            f"`sliplab again {self._run_request.store} {drift.trial} --why ...` and the same "
+            f"command go on (give {drift.first} as well if the new state is the one to compare "
+            "with). Onsets were not compared: they are known after `sliplab label` only"
         )

@@ -16,7 +16,7 @@ from sliplab.protocols.detection import Detection
 from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.rigs.core.reacting import Reflex
-from sliplab.rigs.levels import with_level
+from sliplab.rigs.mock.levels import with_level
 from sliplab.rigs.rig_file import ReflexSettings, RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
 

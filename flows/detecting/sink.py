@@ -28,7 +28,7 @@ from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
 from sliplab.flows.detecting.network_process import NetworkLost
 from sliplab.rigs.core.capabilities import Clock
 from sliplab.rigs.core.reacting import DetectionTimes, SenseLost, SlipDetected
-from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
+from sliplab.storage.streams import EVENTS_KIND, Chunk, EventChunk, NullSink, PulseChunk
 
 PATIENCE_US = 200_000
 """Wait before evaluating a window that no event follows, us on the camera's clock as estimated
@@ -117,7 +117,18 @@ class DetectSink(NullSink):
         """Note that a step of the motion begins."""
         self.phase = phase
 
-    def add_events(self, chunk: EventChunk) -> None:
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Feed the event camera's stream to the detector.
+
+        Raises:
+            SlipDetected, SenseLost, ClockFellBack: as `_feed` and `_advance`.
+        """
+        if device == EVENTS_KIND and isinstance(chunk, EventChunk):
+            self._feed(chunk)
+        elif device == EVENTS_KIND and isinstance(chunk, PulseChunk):
+            self._advance(chunk)
+
+    def _feed(self, chunk: EventChunk) -> None:
         """Feed events to the detector.
 
         Raises:
@@ -131,12 +142,12 @@ class DetectSink(NullSink):
             self._note_life("events", int(chunk.t_us.max()) * 1000, here_ns)
         self._report(self._decided(lambda: self.detector.push(chunk)), here_ns, began_ns)
 
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
+    def _advance(self, chunk: PulseChunk) -> None:
         """Advance the detector to the camera's time, which pulses show without events.
 
         Raises:
-            SlipDetected: as `add_events`.
-            SenseLost: as `add_events`; or neither events nor pulses came for too long.
+            SlipDetected: as `_feed`.
+            SenseLost: as `_feed`; or neither events nor pulses came for too long.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
         if len(chunk):

@@ -45,7 +45,7 @@ def _frame_bytes(
     rig: RigFile, stream: FrameStream, frame_px: tuple[int, int] | None, plate: bool
 ) -> float:
     """Estimate one frame of a further camera: the first one's, by its number of pixels."""
-    if stream.mock is not None and stream.mock.level == "tracks":
+    if stream.mock is not None and stream.mock.frame_source == "tracks":
         return rig.estimates.bytes_per_tracked_frame
     first = rig.estimates.bytes_per_plate_frame if plate else rig.estimates.bytes_per_frame
     if frame_px is None:

@@ -11,7 +11,7 @@ from sliplab.protocols import Plan
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from sliplab.rigs.levels import LevelChoice, SlipExpected
+    from sliplab.rigs.mock.levels import LevelChoice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
     from sliplab.storage.streams import Json
 
@@ -91,7 +91,7 @@ class PlannedScene:
     """A simulated rig's level of physics for a plan, and the slip to expect.
 
     Attributes:
-        expected: see `rigs.levels.slip_expected`.
+        expected: see `rigs.mock.levels.slip_expected`.
     """
 
     choice: LevelChoice
@@ -119,7 +119,7 @@ class PlannedScene:
 
 def scene_of(rig: RigFile, plan: Plan) -> PlannedScene | None:
     """Return the scene of a plan, None on a real rig."""
-    from sliplab.rigs.levels import choose_level, slip_expected
+    from sliplab.rigs.mock.levels import choose_level, slip_expected
 
     choice = choose_level(rig, plan)
     return None if choice is None else PlannedScene(choice, slip_expected(rig, plan))

@@ -236,7 +236,7 @@ def _check_reach(run_request: RunRequest) -> list[PreflightCheck]:
 
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[PreflightCheck]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
-    from sliplab.analysis.clocks.synchronise import further_clocks, streams_of, synchronise
+    from sliplab.analysis.clocks.synchronise import clocks_in, streams_of, synchronise
     from sliplab.analysis.quality import sync_gate
     from sliplab.storage.files import scratch_folder
     from sliplab.storage.trials.checksums import DATA
@@ -249,7 +249,7 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[PreflightCheck]:
         writer = TrialWriter(check, check.with_name("none"), None, rate)
         rig.listen(LISTEN_S, writer, rate)
         sealed = writer.seal()
-        further = further_clocks(sealed, {device.name: device.about for device in rig.further})
+        further = clocks_in(sealed, {device.name: device.about for device in rig.further})
         with StreamReader(sealed / DATA) as reader:
             streams = streams_of(reader, None, further)
     fitted = synchronise(streams, rig.timing, rate)

@@ -17,6 +17,7 @@ from sliplab.flows.planning.campaign_trials import (
 )
 from sliplab.flows.planning.disk_space import check_space
 from sliplab.flows.planning.estimate import plan_bytes
+from sliplab.flows.planning.parameters import NO_METADATA, SessionMetadata
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
@@ -30,23 +31,13 @@ from sliplab.protocols.yaml_file import (
     read_text,
     without_secrets,
 )
-from sliplab.rigs.levels import at_level, with_level
+from sliplab.rigs.mock.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
 """`overrule`: claims are evaluated and do not end the campaign."""
-
-
-@dataclass(frozen=True)
-class SessionMetadata:
-    """Operator and conditions of one session at the rig."""
-
-    operator: str = ""
-    temperature_c: float | None = None
-    humidity_percent: float | None = None
-    note: str = ""
 
 
 class CampaignCounts(TypedDict):
@@ -87,7 +78,7 @@ class RunRequest:
     store: Path
     campaign: str
     enable: tuple[str, ...]
-    metadata: SessionMetadata = SessionMetadata()
+    metadata: SessionMetadata = NO_METADATA
     most: int | None = None
     until: float | None = None
     only: frozenset[str] | None = None
@@ -163,7 +154,7 @@ def make_request(
     *,
     enable: tuple[str, ...] = (),
     campaign: str | None = None,
-    metadata: SessionMetadata = SessionMetadata(),
+    metadata: SessionMetadata = NO_METADATA,
     most: int | None = None,
     until: float | None = None,
     claims: Claims = "use",
@@ -187,7 +178,10 @@ def make_request(
         begun = found if found.begun else None
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
-    rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
+    if level and rig_file.simulated:
+        rig_file = at_level(rig_file, level)
+    else:
+        rig_file = with_level(rig_file, plan)
     run_request = RunRequest(
         plan,
         rig_file,

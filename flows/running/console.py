@@ -10,7 +10,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -61,9 +61,25 @@ messages = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 results = Console(highlight=False, width=results_width(), emoji=False)
 
 
+_listeners: list[Callable[[str], None]] = []
+
+
 def say(text: str) -> None:
     """A line for people."""
-    messages.print(_clean(text), markup=False)
+    line = _clean(text)
+    messages.print(line, markup=False)
+    for listener in _listeners:
+        listener(line)
+
+
+@contextmanager
+def lines_to(listener: Callable[[str], None]) -> Iterator[None]:
+    """Pass the lines for people to `listener`, too, while the block runs."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
 
 
 def show(text: str) -> None:

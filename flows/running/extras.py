@@ -21,11 +21,13 @@ EXTRAS = {
     "learn": ("torch", "sinabs", "sklearn", "threadpoolctl"),
     "prefect": ("prefect",),
     "report": ("matplotlib", "jinja2", "bokeh"),
+    "alerts": ("apprise",),
     "cluster": ("distributed", "prefect_dask"),
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
     "formats": ("faery", "rosbags"),
+    "xarray": ("xarray",),
 }
 """Modules that each extra installs."""
 

@@ -29,6 +29,8 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import masked
 
 if TYPE_CHECKING:
+    from uuid import UUID
+
     from sliplab.flows.running.cluster import Cluster
 
 T = TypeVar("T")
@@ -283,6 +285,21 @@ class _NotSent(Exception):
     """A request was not sent, because the one before it failed."""
 
 
+def show_running(client: Any, run: UUID, name: str, message: str) -> None:
+    """Show on Prefect's page what a run that is running does; another state is left alone.
+
+    Args:
+        client: Prefect's, a synchronous one.
+        name: in place of "Running".
+    """
+    from prefect.states import Running
+
+    known = client.read_flow_run(run).state
+    if known is not None and known.is_running():
+        state: Any = Running(name=name, message=message)
+        client.set_flow_run_state(run, state, force=True)
+
+
 def is_unreachable() -> bool:
     """Return True if the server of the flow that runs now, or ran last, did not answer."""
     return _link is not None and _link.server in _lost_servers
@@ -401,7 +418,8 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
             client = stack.enter_context(link.client())
             if _store is not None:
                 run_records.close_killed_runs(_store, link.server, client)
-            flow_run = client.create_flow_run(flow)
+            name = flow.name if _store is None else f"{flow.name} {_store.name}"
+            flow_run = client.create_flow_run(flow, name=name)
         except Exception as error:
             if cluster is not None:
                 raise ServerError(

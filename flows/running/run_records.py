@@ -103,17 +103,27 @@ def suspended(store: Path, run: str) -> None:
     (_folder(store) / f"{run}.json").unlink(missing_ok=True)
 
 
-def open_runs(store: Path) -> list[Json]:
-    """Runs that began and did not end, as far as the store knows."""
+def runs(store: Path) -> list[tuple[Json, Json | None]]:
+    """Return the runs that began, each with its end if that is known; damaged files are left out.
+
+    A run has ``run``, ``flow``, ``deployment``, ``server``, ``began`` and ``process``; an end has
+    ``state``, ``message``, ``when`` and ``by``.
+    """
     folder = _folder(store)
     if not folder.is_dir():
         return []
-    found = []
+    found: list[tuple[Json, Json | None]] = []
     for path in sorted(folder.iterdir()):
-        if _BEGIN.fullmatch(path.name) and not path.with_suffix(".end.json").exists():
+        if _BEGIN.fullmatch(path.name):
+            ended = path.with_suffix(".end.json")
             with suppress(OSError, ValueError):
-                found.append(read_json(path))
+                found.append((read_json(path), read_json(ended) if ended.exists() else None))
     return found
+
+
+def open_runs(store: Path) -> list[Json]:
+    """Return the runs that began and did not end, as far as the store knows."""
+    return [run for run, ended in runs(store) if ended is None]
 
 
 def close_killed_runs(store: Path, server: str, client: Any = None) -> list[Json]:

@@ -18,7 +18,7 @@ from prefect import flow
 from sliplab.flows.collecting import requests
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.supervisor import WindowOver
-from sliplab.flows.planning.run_request import RunRequest, SessionMetadata, check_disk, make_request
+from sliplab.flows.planning.run_request import RunRequest, check_disk, make_request
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import die_with
 from sliplab.flows.server.schedules import (
@@ -139,12 +139,10 @@ def when_free(
 def _report_waiting(run: Any, why: str) -> None:
     """Show on Prefect's page that a run waits for its rig."""
     from prefect.client.orchestration import get_client
-    from prefect.states import Running
 
     console.say(f"waiting: {why}")
     with suppress(Exception), get_client(sync_client=True) as client:
-        state: Any = Running(name="WaitingForRig", message=why)
-        client.set_flow_run_state(run.id, state, force=True)
+        orchestration.show_running(client, run.id, "WaitingForRig", why)
 
 
 def _words(error: Exception) -> str:
@@ -181,8 +179,8 @@ def train(wanted: ScheduledStep = STEP) -> Any:
 @served(name="evaluate")
 def evaluate(wanted: Evaluate = EVALUATE) -> Any:
     """Evaluate the network on the test trials."""
-    options = {"margin": wanted.margin, "smoothing": wanted.smoothing}
-    return run_of(lambda here, run: _steps(here, wanted.campaigns, "evaluate", **options))
+    rule = {"margin": wanted.margin, "smoothing": wanted.smoothing}
+    return run_of(lambda here, run: _steps(here, wanted.campaigns, "evaluate", **rule))
 
 
 @served(name="report")
@@ -230,16 +228,9 @@ CONTROL = (pause, resume, stop)
 def _run_request(
     here: Service, wanted: OnRig, protocol: Path, run: Any, **options: Any
 ) -> RunRequest:
-    metadata = SessionMetadata(
-        wanted.operator, wanted.temperature_c, wanted.humidity_percent, wanted.note
-    )
+    given = {"metadata": wanted, **options}
     run_request = make_request(
-        protocol,
-        Path(here.rig),
-        here.folder,
-        metadata=metadata,
-        until=until_of(wanted, run),
-        **options,
+        protocol, Path(here.rig), here.folder, until=until_of(wanted, run), **given
     )
     check_disk([run_request])
     return run_request
@@ -257,16 +248,8 @@ def _take(wanted: OnRig, run_request: RunRequest, run: Any) -> str:
 
 
 def _collect(wanted: Collect, here: Service, run: Any) -> str:
-    run_request = _run_request(
-        here,
-        wanted,
-        here.protocol(wanted.protocol),
-        run,
-        most=wanted.trials,
-        campaign=wanted.campaign,
-        enable=tuple(wanted.enable),
-        claims="overrule" if wanted.no_stopping else "use",
-    )
+    protocol = here.protocol(wanted.protocol)
+    run_request = _run_request(here, wanted, protocol, run, **wanted.arguments())
     return _take(wanted, run_request, run)
 
 
@@ -308,11 +291,11 @@ def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> st
 
 def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:
     store = open_store(here.folder)
-    who = wanted.who or "Prefect's page"
+    given = {**wanted.arguments(), "who": wanted.who or "Prefect's page"}
     if kind == "stop":
-        outcome = requests.stop_collection(store, who=who, why=wanted.why, limit_s=wanted.wait_s)
+        outcome = requests.stop_collection(store, **given)
     else:
-        outcome = requests.ask(store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s)
+        outcome = requests.ask(store, kind, **given)
     if outcome.answer is None:
         return f"{kind}: not yet; request {outcome.request.number} is still open"
     return f"{kind}: done, request {outcome.request.number}: {outcome.answer['did']}"

@@ -24,6 +24,8 @@ from zoneinfo import ZoneInfo, available_timezones
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
+from sliplab.flows.planning import parameters
+from sliplab.flows.planning.parameters import CollectOptions, Rule, SessionMetadata
 from sliplab.protocols import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean, one_of
@@ -113,21 +115,9 @@ def cron_of(days: list[str], begin: str) -> str:
     return f"{int(minute)} {int(hour)} * * {','.join(days)}"
 
 
-class Parameters(StrictModel):
-    """Base of all: an unknown parameter is an error."""
-
-
-class OnRig(Parameters):
+class OnRig(SessionMetadata):
     """Parameters of every deployment that moves the arm."""
 
-    operator: str = Field(default="", description="Operator at the rig.")
-    temperature_c: float | None = Field(
-        default=None, ge=-50, le=100, description="Room temperature, degrees Celsius."
-    )
-    humidity_percent: float | None = Field(
-        default=None, ge=0, le=100, description="Relative, percent."
-    )
-    note: str = Field(default="", description="A note to store with the session.")
     until: Until | None = Field(
         default=None,
         description='When the rig must be free again: "06:00" or "mon 06:00". No trial is begun '
@@ -143,18 +133,10 @@ class OnRig(Parameters):
     )
 
 
-class Collect(OnRig):
+class Collect(OnRig, CollectOptions):
     """Parameters of collecting the missing trials of a protocol."""
 
     protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
-    trials: int | None = Field(
-        default=None, ge=1, le=1_000_000, description="Collect at most this many trials."
-    )
-    enable: list[str] = Field(default=[], description="Optional levels to enable: factor=level.")
-    campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
-    no_stopping: bool = Field(
-        default=False, description="Go on where the protocol's claims would end the campaign."
-    )
 
 
 class ScheduledChain(Collect):
@@ -175,38 +157,24 @@ class ScheduledStudy(OnRig):
     )
 
 
-class ScheduledStep(Parameters):
+class ScheduledStep(StrictModel):
     """Parameters of an analysis step on stored trials."""
 
     campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
-class Evaluate(ScheduledStep):
+class Evaluate(Rule, ScheduledStep):
     """Parameters of evaluating the network on the test trials."""
 
-    margin: float | None = Field(
-        default=None, ge=0, le=1e6, description="Spikes a winner must lead by."
-    )
-    smoothing: int | None = Field(
-        default=None, ge=1, le=1000, description="Windows to average over."
-    )
 
+class Ask(parameters.Ask):
+    """Parameters of a request from Prefect's page to the current collection."""
 
-class Ask(Parameters):
-    """Parameters of a request to the current collection."""
-
-    who: str = Field(default="", description="Requester's name; stored with the request.")
-    why: str = Field(default="", description="The reason; stored with the request.")
-    wait_s: float = Field(
-        default=600.0,
-        ge=0,
-        le=86400,
-        description="Maximum wait until the request is carried out, s.",
-    )
+    who: str = Field(default="", description="Your name; default: Prefect's page.")
 
 
 FlowName = Literal["collect", "label", "train", "evaluate", "report", "study", "chain"]
-SCHEDULED: dict[FlowName, type[Parameters]] = {
+SCHEDULED: dict[FlowName, type[StrictModel]] = {
     "collect": Collect,
     "label": ScheduledStep,
     "train": ScheduledStep,
@@ -241,16 +209,16 @@ class StartTimes(StrictModel):
 _TIMING = {*StartTimes.model_fields, "flow", "timezone"}
 
 
-def _schedule(flow: FlowName, parameters: type[Parameters]) -> type[BaseModel]:
+def _schedule(flow: FlowName, model: type[StrictModel]) -> type[BaseModel]:
     """Timing and the parameters of one flow in one mapping, as a person writes it."""
     kind: Any = Literal[flow]
     made: type[BaseModel] = create_model(
-        f"{flow} schedule", __base__=(StartTimes, parameters), flow=(kind, ...)
+        f"{flow} schedule", __base__=(StartTimes, model), flow=(kind, ...)
     )
     return made
 
 
-_MODELS = {flow: _schedule(flow, parameters) for flow, parameters in SCHEDULED.items()}
+_MODELS = {flow: _schedule(flow, model) for flow, model in SCHEDULED.items()}
 
 
 class Scheduled(StrictModel):
@@ -278,6 +246,8 @@ class _File(StrictModel):
 
     timezone: Zone
     schedules: list[dict[str, Any]]
+    alerts: dict[str, Any] | None = None
+    """`sliplab alerts` reads it."""
 
 
 def load_schedules(path: Path) -> list[Scheduled]:

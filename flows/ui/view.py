@@ -40,19 +40,11 @@ from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import RATE_NS, event_rate
-from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import (
-    EVENTS_KIND,
-    FRAMES_KIND,
-    I64,
-    EventChunk,
-    ScalarChunk,
-    WrenchChunk,
-)
+from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, SCALAR, WRENCH, EventChunk
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
@@ -65,25 +57,10 @@ def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
     """Find the committed trial of this id.
 
     Raises:
-        InputError: it does not exist, or several campaigns have it.
+        NoTrial: it does not exist, or several campaigns have it.
     """
-    found = [
-        Collected(item)
-        for item in store.campaigns()
-        if campaign in (None, item.name) and trial in item.committed()
-    ]
-    if not found:
-        where = str(store.folder) if campaign is None else f"campaign '{campaign}'"
-        raise InputError(
-            "TRIAL",
-            "",
-            trial,
-            f"is no committed trial of {where}; `sliplab trials {store.folder}` lists them",
-        )
-    if len(found) > 1:
-        names = ", ".join(item.name for item in found)
-        raise InputError("TRIAL", "", trial, f"is in {names}; name one with --campaign")
-    return Subject(store, found[0], found[0].campaign.recording(trial))
+    item = store.holder(trial, campaign)
+    return Subject(store, Collected(item), item.recording(trial))
 
 
 def rerun() -> ModuleType:
@@ -335,16 +312,16 @@ def _further(to: _Columns, recording: Recording) -> None:
         elif about.kind == FRAMES_KIND:
             _pictures(to, recording, name, path)
             to.sent[count] = about.rows
-        elif about.kind == WrenchChunk.KIND and recording.record.imported is not None:
+        elif about.kind == WRENCH.name and recording.record.imported is not None:
             wrench = recording.wrenches(name)
             time_ns = np.asarray(recording.clock(name).to_reference(wrench.t_ns))
             for axis, values in zip("xyz", wrench.force_n.T, strict=True):
                 to.scalars(f"{path}/f{axis}", time_ns, values, count if axis == "x" else "")
-        elif about.kind == WrenchChunk.KIND and about.timing is not None:
+        elif about.kind == WRENCH.name and about.timing is not None:
             forces = plate_forces(recording, name)
             to.scalars(f"{path}/normal", forces.t_ns, forces.normal_n, count)
             to.scalars(f"{path}/tangential", forces.t_ns, forces.tangential_n)
-        elif about.kind == ScalarChunk.KIND:
+        elif about.kind == SCALAR.name:
             found = recording.scalars(name)
             time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
             to.once(path, to.rr.SeriesLines(names=f"{name} ({found.unit})"))
@@ -528,7 +505,7 @@ def blueprint(
     """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
-    curves_of = _named(further, ScalarChunk.KIND, WrenchChunk.KIND)
+    curves_of = _named(further, SCALAR.name, WRENCH.name)
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (

@@ -5,18 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
-from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.driver import ArmDriver, ArmScene, lazy
 from sliplab.rigs.core.network import answers, arm_lock
 
 if TYPE_CHECKING:
-    from sliplab.rigs.core.capabilities import Arm
     from sliplab.rigs.core.fakes import FakeController
-
-
-def _build(settings: AbbSocketSettings) -> Arm:
-    from sliplab.plugins.abb_socket.driver import AbbSocketArm
-
-    return AbbSocketArm(settings)
 
 
 def _fake(settings: AbbSocketSettings, scene: ArmScene) -> FakeController:
@@ -32,7 +25,7 @@ DRIVER = ArmDriver(
     ping=lambda settings: answers(settings.host, settings.port),
     address=lambda settings: settings.host,
     locks=arm_lock,
-    build=_build,
+    build=lazy("sliplab.plugins.abb_socket.driver:AbbSocketArm"),
     twists=False,  # it rests between the pieces of a turn, whose zones are too small
     fake=_fake,
 )

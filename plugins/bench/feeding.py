@@ -85,9 +85,7 @@ def _chunks(scene: Scene, chunk_us: int) -> Iterator[tuple[EventChunk, int, int]
     cuts = np.searchsorted(scene.events.t_us, edges)
     every = scene.events
     for k, (before_us, until_us) in enumerate(pairwise(edges)):
-        part = slice(cuts[k], cuts[k + 1])
-        events = EventChunk(every.x[part], every.y[part], every.p[part], every.t_us[part])
-        yield events, before_us, until_us
+        yield every[cuts[k] : cuts[k + 1]], before_us, until_us
 
 
 def _checked(found: Evidence, scene: str, before_us: int, until_us: int) -> Evidence:

@@ -43,7 +43,7 @@ class WindowDetector(Detector):
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
-        held = EventChunk.joined([self._held, events])
+        held = EventChunk.concatenate([self._held, events])
         starts = np.arange(
             self._next_us, until_us - self._length_us + 1, self._stride_us, dtype=np.int64
         )
@@ -51,7 +51,7 @@ class WindowDetector(Detector):
             self._next_us = int(starts[-1]) + self._stride_us
         x = list_events(held, starts, self.windows, *self._size)
         old = slice(int(np.searchsorted(held.t_us, self._next_us)), None)
-        self._held = EventChunk(held.x[old], held.y[old], held.p[old], held.t_us[old])
+        self._held = held[old]
         if not len(starts):
             return Evidence.of([], [])
         value, label = self.decide(x)

@@ -141,7 +141,7 @@ class NewestPacketOnly(ExampleEvents):
 
     def read(self) -> EventChunk:
         """Events of the last packet."""
-        return EventChunk.joined(self._buffer.take("events")[-1:])
+        return EventChunk.concatenate(self._buffer.take("events")[-1:])
 
 
 class OldData(FakedExampleFrames):

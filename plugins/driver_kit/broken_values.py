@@ -196,12 +196,8 @@ class SamplesTwice(ExampleArm):
         found, last = super().read_poses(), self.last
         if not len(found):
             return found
-        self.last = PoseChunk(*(column[-1:] for column in vars(found).values()))
-        if last is None:
-            return found
-        return PoseChunk(
-            *(np.concatenate([getattr(c, n) for c in (last, found)]) for n in vars(found))
-        )
+        self.last = found[-1:]
+        return found if last is None else PoseChunk.concatenate([last, found])
 
 
 class CommandedPose(ExampleArm):
@@ -408,12 +404,12 @@ ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
     ),
     "SamplesTwice": (SamplesTwice, (POSES,), "was read twice"),
     "NewestSampleOnly": (
-        reports(ExampleArm, lambda c: PoseChunk(*(v[-1:] for v in vars(c).values())), "read_poses"),
+        reports(ExampleArm, lambda c: c[-1:], "read_poses"),
         (POSES,),
         "returned 1 samples of 0.000 s",
     ),
     "LosesLastSample": (
-        reports(ExampleArm, lambda c: PoseChunk(*(v[:-1] for v in vars(c).values())), "read_poses"),
+        reports(ExampleArm, lambda c: c[:-1], "read_poses"),
         (POSES,),
         "each read loses some",
     ),
@@ -500,7 +496,7 @@ class EventsTwice(ExampleEvents):
         """Events since the last call."""
         found, last = super().read(), self.last
         self.last = found if len(found) else last
-        return EventChunk.joined([last, found]) if last is not None and len(found) else found
+        return EventChunk.concatenate([last, found]) if last is not None and len(found) else found
 
 
 class OldPulses(ExampleEvents):
@@ -613,7 +609,7 @@ class KeepsTicking(ExampleSync):
 def first_of_each_time(chunk: EventChunk) -> EventChunk:
     """Keep the first one of events at the same time."""
     _, rows = np.unique(chunk.t_us, return_index=True)
-    return EventChunk(*(column[rows] for column in vars(chunk).values()))
+    return chunk[rows]
 
 
 def first_load(chunk: Any) -> Any:

@@ -39,11 +39,11 @@ from sliplab.storage.streams import (
     FRAMES_KIND,
     I64,
     U8,
+    Chunk,
     FrameChunk,
     Json,
     PoseChunk,
     ScalarChunk,
-    StreamChunk,
     WrenchChunk,
 )
 from sliplab.storage.trials.store import STORE
@@ -401,7 +401,7 @@ class _Streams:
     t_ns: I64
     taken: set[str]
     poses: PoseChunk | None = None
-    streams: dict[str, StreamChunk] = field(default_factory=dict)
+    streams: dict[str, Chunk] = field(default_factory=dict)
     sources: dict[str, str] = field(default_factory=dict)
 
     def add(self, vector: _Vector, values: F64) -> None:

@@ -47,7 +47,6 @@ from sliplab.storage.formats.foreign import (
     Triggers,
     as_damage,
     empty_events,
-    part_of,
     read_head,
 )
 from sliplab.storage.formats.format import Format
@@ -354,7 +353,7 @@ def _decoded(
             )
             fault = int(state[FAULT])
             if fault or filled > _CHUNK - ROOM or state[EDGES] == _EDGES:
-                yield part_of(chunk, 0, filled), edges[: state[EDGES]].copy()
+                yield chunk[:filled], edges[: state[EDGES]].copy()
                 chunk, filled, state[EDGES] = empty_events(_CHUNK), 0, 0
             if fault:
                 where = f"{width} x {height} pixels {'in its header' if header.size else 'of all'}"
@@ -366,7 +365,7 @@ def _decoded(
                 if events_out:
                     out = {EVENTS_OUTSIDE: events_out}
                     yield _left_out(out), edges[:0].copy()
-    yield part_of(chunk, 0, filled), edges[: state[EDGES]].copy()
+    yield chunk[:filled], edges[: state[EDGES]].copy()
 
 
 def _reason(state: I64, where: str) -> str:

@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from sliplab.plugins.publish.publication import Publication
 from sliplab.protocols.shown import plural
+from sliplab.storage.streams import Column
 from sliplab.storage.trials.hdf5_writer import COLUMNS, STREAMS, TIMING, TRACKS
 from sliplab.storage.trials.store import IMPORTED
 
@@ -222,20 +223,24 @@ def _columns_of(table: pa.Table) -> list[str]:
 
 def _hdf5() -> list[str]:
     rows = [
-        [f"`{name}`", f"{kind}{_shape(shape)}", unit]
-        for name, (kind, shape, unit) in {**COLUMNS, **TRACKS, **TIMING}.items()
+        [f"`{name}`", _type(column), column.unit]
+        for name, column in {**COLUMNS, **TRACKS, **TIMING}.items()
     ]
     rows += [
-        [f"`streams/NAME/{part}`, kind `{stream}`", f"{kind}{_shape(shape)}", unit]
-        for stream, columns in STREAMS.items()
-        for part, (_, (kind, shape, unit)) in columns.items()
+        [
+            f"`streams/NAME/{part}`, kind `{name}`",
+            _type(column),
+            column.unit,
+        ]
+        for name, kind in STREAMS.items()
+        for part, column in kind.columns.items()
     ]
     text = "A trial has the first fifteen columns, and of the others those that its rig recorded."
     return [text, "", *_rows(("column", "type", "unit"), rows)]
 
 
-def _shape(shape: tuple[int, ...]) -> str:
-    return f" x {' x '.join('n' if size < 0 else str(size) for size in shape)}" if shape else ""
+def _type(column: Column) -> str:
+    return " x ".join([column.dtype, *("n" if size < 0 else str(size) for size in column.shape)])
 
 
 def _limits(publication: Publication) -> Iterable[str]:

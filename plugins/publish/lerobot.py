@@ -25,7 +25,7 @@ from sliplab.plugins.publish.publication import SPLITS, Publication
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json_aside
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, I64, U8, Json, WrenchChunk
+from sliplab.storage.streams import EVENTS_KIND, I64, U8, WRENCH, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
@@ -165,9 +165,9 @@ def _features(recordings: list[Recording]) -> tuple[dict[str, Json], tuple[str, 
     }
     if all(r.record.counts.poses and r.record.clocks.arm is not None for r in recordings):
         features[STATE] = _vector(_POSE)
-    shared = set(recordings[0].streams(WrenchChunk.KIND))
+    shared = set(recordings[0].streams(WRENCH.name))
     for recording in recordings:
-        shared &= set(recording.streams(WrenchChunk.KIND)) & recording.clocks.devices().keys()
+        shared &= set(recording.streams(WRENCH.name)) & recording.clocks.devices().keys()
     for name in sorted(shared):
         features[f"observation.{name}"] = _vector(_WRENCH)
     event_px = {r.record.geometry.event_px for r in recordings}

@@ -31,9 +31,10 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.rigs.build import build_rig, loopback_rig
+from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.streams import Json
 

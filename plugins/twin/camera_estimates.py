@@ -162,7 +162,7 @@ def _events(trial: PilotTrial, begin_s: float, end_s: float) -> EventChunk:
     assert trial.camera is not None
     events = trial.camera.events
     part = slice(*np.searchsorted(events.t_us, (begin_s * 1e6, end_s * 1e6)).tolist())
-    return EventChunk(events.x[part], events.y[part], events.p[part], events.t_us[part])
+    return events[part]
 
 
 def _moved_s(trial: PilotTrial, way_mm: float) -> float:
@@ -201,7 +201,7 @@ def _rests(trials: Sequence[PilotTrial], size_px: tuple[int, int]) -> F64 | None
         alike = np.hypot(*(ways - ways[first]).T) < 0.1
         tried |= alike
         together = [t for t, same in zip(trials, alike, strict=True) if same]
-        events = EventChunk.joined(
+        events = EventChunk.concatenate(
             [_events(trial, 0.0, _moved_s(trial, FIRST_MM)) for trial in together]
         )
         discs = find_discs(events, layout, size_px)
@@ -306,9 +306,7 @@ def _times(
     width, height = size_px
     scans: list[ScanningReadout] = []
     for trial in trials[:SCANNED]:
-        events = _events(trial, -np.inf, np.inf)
-        part = slice(SCANNED_EVENTS)
-        events = EventChunk(events.x[part], events.y[part], events.p[part], events.t_us[part])
+        events = _events(trial, -np.inf, np.inf)[:SCANNED_EVENTS]
         scan = find_scans(events, width)
         if scan is not None:
             scans.append(scan)

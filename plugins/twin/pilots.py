@@ -24,7 +24,7 @@ from sliplab.plugins.twin.pilot import (
 from sliplab.plugins.twin.statistics import SlideStatistics, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.levels import choose_level
+from sliplab.rigs.mock.levels import choose_level
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import (
     EventChunk,
@@ -224,7 +224,7 @@ def simulate_pilot(
             )
             camera = forces = None
             if with_events and sink.events:
-                events = EventChunk.joined(sink.events)
+                events = EventChunk.concatenate(sink.events)
                 t_us = events.t_us - start_ns // 1000
                 camera = SlideEvents(
                     EventChunk(events.x, events.y, events.p, t_us),

@@ -26,9 +26,9 @@ from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, simulate_pilot
 from sliplab.plugins.twin.posterior import Bank
 from sliplab.plugins.twin.statistics import VERSION, SlideStatistics, of_names, statistics
 from sliplab.protocols import Plan, Trial
-from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.devices import build_mock
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived, make_key

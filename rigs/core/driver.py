@@ -8,14 +8,17 @@ library is loaded when a device is built, not when a rig file is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings, GripperSettings
+from sliplab.rigs.core.sections import RigSection, SimulatedStream
 
 if TYPE_CHECKING:
+    from sliplab.protocols.key_errors import KeyedError
     from sliplab.protocols.timing import Code, FrameGrade
     from sliplab.rigs.core.capabilities import (
         Arm,
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from sliplab.rigs.core.fakes import FakeController
     from sliplab.rigs.core.finger_motion import FingerMotion
     from sliplab.rigs.core.gripper_range import GripperRange
+    from sliplab.rigs.core.rig import Rig
     from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
@@ -45,16 +49,50 @@ def _no_address(settings: Any) -> str:
     return ""
 
 
+def lazy(place: str) -> Callable[..., Any]:
+    """Return a function that imports ``module:object`` when it is called, and calls that."""
+    module, _, name = place.partition(":")
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        return getattr(import_module(module), name)(*arguments, **named)
+
+    return call
+
+
 @dataclass(frozen=True)
-class Driver(Generic[SettingsT]):
-    """The declaration of one type of device. `name` is the value of `driver:` in rig files."""
+class Declaration:
+    """The declaration of what a rig file names by `driver:`."""
 
     kind: ClassVar[str]
-    """``arm``, ``event camera``, ``frame camera``, ``sync box``, ``force sensor``, ``gripper`` or
-    ``scalar sensor``."""
+    """``arm``, ``event camera``, ``frame camera``, ``sync box``, ``force sensor``, ``gripper``,
+    ``scalar sensor`` or ``rig``."""
     name: str
     title: str
     """Make and model for people, such as ``Universal Robots``."""
+
+
+@dataclass(frozen=True)
+class RigDriver(Declaration):
+    """A way to run a rig: real devices, simulated ones, or real drivers on fakes."""
+
+    kind = "rig"
+    sections: tuple[str, ...] = field(kw_only=True)
+    """Sections that its rig files have: `devices`, `mock`; the first one has what is driven."""
+    settings: type[RigSection] = field(kw_only=True)
+    """Model of its first section."""
+    build: Callable[[Any, Callable[[], bool]], Rig] = field(kw_only=True)
+    """Build the rig of a `rigs.rig_file.RigFile`, its arm not connected yet; the other argument
+    returns whether a stop was requested. Raises RigError."""
+    faults: Callable[[Any], Iterable[KeyedError]] = lambda rig: ()
+    """Return what else is wrong with such a file."""
+    streams: Mapping[str, type[SimulatedStream]] = field(default_factory=dict)
+    """Models of simulated further devices, by the kinds of their streams."""
+
+
+@dataclass(frozen=True)
+class Driver(Declaration, Generic[SettingsT]):
+    """The declaration of one type of device. `name` is the value of `driver:` in rig files."""
+
     settings: type[SettingsT]
     """Keys that a rig file may write; field `driver` is a `Literal` of `name`."""
     ping: Callable[[SettingsT], str | None]
@@ -152,7 +190,7 @@ class FrameCameraDriver(Driver[SettingsT]):
     """Open the device, not grabbing yet, with its scale in px per mm. Raises RigError."""
     fake: Callable[[SettingsT, float, SceneFrames, int], FrameCamera] | None = None
     """Open the driver on frames of a scene: settings, px per mm, frames, half the exposure (ns)."""
-    unplug: Callable[[FrameCamera], None] | None = None
+    unplug: Callable[[Any], None] | None = None
     """Unplug a camera that `fake` has opened, for tests."""
     grade: FrameGrade = "hardware trigger"
     """Timing of frames on a loopback rig: `host arrival` where the camera is free-running."""

@@ -36,12 +36,6 @@ _OUTWARD_MM = 0.01
 """Depth by which a motion goes outwards: there contact may end, and an ideal sensor reads zero."""
 _SAME_N = 1e-6
 """Largest difference of normal forces that are the same, N: a mounting rounds."""
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "t_ns": (),
-    "host_ns": (),
-    "force_n": (3,),
-    "torque_nm": (3,),
-}
 _LINE_NS = 10_000_000
 _FEWEST = 5
 """Samples through which a straight line is laid: those of the last 10 ms, at least five."""
@@ -184,7 +178,7 @@ class ForceWatch:
         if not isinstance(chunk, WrenchChunk):
             raise _unusable(f"returned {type(chunk).__name__}, not a WrenchChunk")
         count = len(chunk)
-        for name, shape in _SHAPES.items():
+        for name, _, shape, _ in WrenchChunk.KIND.columns.values():
             values = getattr(chunk, name)
             if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
                 kind = getattr(values, "dtype", type(values).__name__)

@@ -188,7 +188,7 @@ def run_watched(
                 streaming, watcher.guarded = True, reflex is not None or safe is not None
             if streaming and not step.recorded:
                 watcher.guarded = False
-                rig.stop_streams(watcher, False)
+                rig.stop_streams(watcher)
                 streaming = False
             if reaction is not None:
                 step = _from_current_position(step, course.at)

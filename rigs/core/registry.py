@@ -15,14 +15,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from sliplab.protocols.plugin import package_of, plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import did_you_mean
-from sliplab.rigs.core.driver import Driver
+from sliplab.rigs.core.driver import Declaration
 
-DriverT = TypeVar("DriverT", bound=Driver[Any])
+DriverT = TypeVar("DriverT", bound=Declaration)
 GROUP = "sliplab.drivers"
 BUILT_IN = {
     "ur": "sliplab.rigs.devices.ur:DRIVER",
@@ -33,6 +33,9 @@ BUILT_IN = {
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
     "ati_net_ft": "sliplab.rigs.devices.ati_net_ft:DRIVER",
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
+    "mock": "sliplab.rigs.mock:DRIVER",
+    "devices": "sliplab.rigs.real:DRIVER",
+    "loopback": "sliplab.rigs.loopback:DRIVER",
 }
 
 
@@ -54,7 +57,7 @@ class Listed:
 @cache
 def listed() -> dict[str, Listed]:
     """Return every installed driver by name, those that ship first."""
-    found = _built_in()
+    found = dict(_built_in())
     for subject, plugin in plugins().found.items():
         for name, place in plugin.drivers.items():
             found.setdefault(name, Listed(name, place, plugins().packages[subject]))
@@ -66,6 +69,7 @@ def listed() -> dict[str, Listed]:
     return found
 
 
+@cache
 def _built_in() -> dict[str, Listed]:
     return {name: Listed(name, place, "sliplab") for name, place in BUILT_IN.items()}
 
@@ -96,7 +100,7 @@ def find_driver(name: str, kind: type[DriverT]) -> DriverT:
     return driver
 
 
-def _unknown(name: str, kind: type[Driver[Any]]) -> str:
+def _unknown(name: str, kind: type[Declaration]) -> str:
     """Return the message about a driver of no installed package."""
     names, broken = [], []
     for item in listed().values():
@@ -113,7 +117,7 @@ def _unknown(name: str, kind: type[Driver[Any]]) -> str:
 
 
 @cache
-def load_driver(item: Listed) -> Driver[Any]:
+def load_driver(item: Listed) -> Declaration:
     """Import the driver that an entry point names.
 
     Raises:
@@ -123,7 +127,7 @@ def load_driver(item: Listed) -> Driver[Any]:
         driver = import_foreign(item.place)
     except PluginError as error:
         raise DriverError(f"{item.name} of {item.package} cannot be imported: {error}") from None
-    if not isinstance(driver, Driver):
+    if not isinstance(driver, Declaration):
         text = f"{item.place} is a {type(driver).__name__}, not a Driver"
         raise DriverError(f"{item.name} of {item.package} cannot be used: {text}")
     if driver.name != item.name:

@@ -29,7 +29,7 @@ from sliplab.protocols.program import (
     Step,
     Twist,
 )
-from sliplab.protocols.timing import ForceTiming, Timing
+from sliplab.protocols.timing import ForceTiming, StreamTiming, Timing
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -52,8 +52,8 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
     Truth,
 )
+from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.force_watch import ForceLimitError, ForceWatch, PressPlaces
-from sliplab.rigs.core.further import FurtherStream
 from sliplab.rigs.core.gripper_check import check_move, check_state
 from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.motion_watch import MotionWatch, check_pose, is_near
@@ -61,7 +61,17 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import POLL_S, QUIET_S, NoiseWatch, RateTouch, count_central
-from sliplab.storage.streams import EventChunk, Json, PathSegment, Sink, StepTimes
+from sliplab.storage.schema.trial import StreamRecord
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
+    EventChunk,
+    ExposureChunk,
+    Json,
+    PathSegment,
+    Sink,
+    StepTimes,
+)
 
 RETRACT_SPEED_MM_S = 10.0
 """Speed of moves that no protocol names; a rig's lower limit applies."""
@@ -159,16 +169,14 @@ class Rig:
     force: ForceSensor | None = None
     force_limit_n: float | None = None
     guard: Guard = field(default_factory=lambda: Guard(None))
-    further: tuple[FurtherStream, ...] = ()
+    further: tuple[DeviceStream, ...] = ()
     gripper: Gripper | None = None
     grip_opening_mm: float = 0.0
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     on_close: tuple[Callable[[], None], ...] = ()
-    _streaming: EventCamera | None = field(default=None, init=False)
-    """The event camera while it is recorded."""
-    _reading: tuple[FurtherStream, ...] = field(default=(), init=False)
-    """The further devices while they are recorded."""
+    _reading: tuple[DeviceStream, ...] = field(default=(), init=False)
+    """The streams that are recorded now, besides the arm's, the sync box's and the first forces."""
     _forces: ForceWatch | None = field(default=None, init=False)
     """Forces while they are watched, whether or not they are recorded."""
     _motion: MotionWatch | None = field(default=None, init=False)
@@ -230,12 +238,9 @@ class Rig:
         self.sync.connect()
         self.arm.connect()
         self._zeroed = False
-        if self.force is not None:
-            self.force.connect()
-        if self.gripper is not None:
-            self.gripper.connect()
-        for device in self.further:
-            device.connect()
+        for device in (self.force, self.gripper, *self.further):
+            if device is not None:
+                device.connect()
 
     def close(self) -> None:
         """Stop the arm, then close every device; safe to call more than once.
@@ -277,13 +282,11 @@ class Rig:
             "event_camera": self.event_camera,
             "frame_camera": self.frame_camera,
             "force_sensor": self.force,
+            **{stream.name: stream for stream in self.further},
         }
         for name, device in devices.items():
-            if (describe := getattr(device, "describe", None)) is not None:
-                described[name] = describe()
-        for further in self.further:
-            if (settings := further.describe()) is not None:
-                described[further.name] = settings
+            if (settings := getattr(device, "describe", lambda: None)()) is not None:
+                described[name] = settings
         losses = getattr(self.sync, "losses", None)
         if losses is not None:
             described["sync_box"] = {"losses": vars(losses)}
@@ -324,7 +327,7 @@ class Rig:
                     self.start_streams(seed, rate_hz, frame_px is not None, with_events)
                     recording = True
                 if recording and not step.recorded:
-                    self.stop_streams(sink, frame_px is not None)
+                    self.stop_streams(sink)
                     recording = False
                 if step.phase in ACTING and not reference:
                     reference = self.arm.now_ns()
@@ -528,7 +531,7 @@ class Rig:
             except ForceLimitError:
                 self._stop_arm()  # it is not moved by this program
                 raise
-            self.stop_streams(sink, False)
+            self.stop_streams(sink)
 
     def _approach_until_touch(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
@@ -748,7 +751,7 @@ class Rig:
             if self._forces is not None:
                 forces = self._forces.read()
                 if sink is not None:
-                    sink.add_stream(FORCE, forces)
+                    sink.add(FORCE, forces)
             if self._motion is not None:
                 self._look(self._motion)
             elif resting is not None:  # no motion was sent, but another program may send one
@@ -776,71 +779,70 @@ class Rig:
         """Start the streams; earlier data are discarded. Raises RigError."""
         self.arm.read_poses()
         self.arm.read_pulses()
-        self._streaming = self.event_camera if with_events else None
-        if self._streaming is not None:
-            self._streaming.start()
         if self._forces is not None:
             self._forces.start()
         elif self.force is not None and self._often:
             self._watch_forces()
         elif self.force is not None:
             self.force.start()
-        self._reading = self.further if with_further else ()
-        for device in self._reading:
-            device.start()
-        free_running = with_frames and self.timing.frames == "exposure line"
-        if with_frames and not free_running:
-            self.frames.start()
+        own = self._own_streams(with_events, with_frames)
+        self._reading = (*own, *(self.further if with_further else ()))
+        for stream in self._reading:
+            if not self._by_exposures(stream):
+                stream.start()
         self.sync.start(rate_hz, seed % SEEDS + 1, self.timing.code)
-        if free_running:
-            # the box must be running to stamp the first exposure too
-            self.frames.start()
+        for stream in filter(self._by_exposures, self._reading):
+            stream.start()
 
-    def stop_streams(self, sink: Sink, with_frames: bool) -> None:
+    def _own_streams(self, with_events: bool, with_frames: bool) -> list[DeviceStream]:
+        """Return the streams of the first cameras that are to be recorded."""
+        found = []
+        if with_events and self.event_camera is not None:
+            about = StreamRecord(kind=EVENTS_KIND, rows=0)
+            found.append(DeviceStream(EVENTS_KIND, self.event_camera, about))
+        if with_frames:
+            by_reads = self.timing.frames == "device time stamps"
+            timing = StreamTiming(grade="device time stamps") if by_reads else None
+            about = StreamRecord(kind=FRAMES_KIND, rows=0, timing=timing)
+            found.append(DeviceStream(FRAMES_KIND, self.frames, about))
+        return found
+
+    def _by_exposures(self, stream: DeviceStream) -> bool:
+        """Return whether the box stamps a stream's exposures: it must run from the first one on."""
+        return stream.name == FRAMES_KIND and self.timing.frames == "exposure line"
+
+    def stop_streams(self, sink: Sink) -> None:
         """Stop the pulses, and read the data that cameras still hold before and after they stop.
 
         Events later than `tail_s` after the motion are discarded; late pulses and frames are read.
         """
-        if with_frames and self.timing.frames == "exposure line":
-            self.frames.stop()
+        for stream in filter(self._by_exposures, self._reading):
+            stream.stop()
         self.sync.stop()
         self.wait(self.tail_s, sink)
-        if self._streaming is not None:
-            self._streaming.stop()
-            sink.add_event_pulses(self._streaming.read_pulses())
+        for stream in self._reading:
+            stream.finish(sink)
+        self._reading = ()
         if self.force is not None:
             self._forces = None
             self.force.stop()
-            sink.add_stream(FORCE, self.force.read())
-        if with_frames:
-            self.frames.stop()
-            sink.add_frames(self.frames.read())
-        for device in self._reading:
-            device.finish(sink)
-        self._reading = ()
+            sink.add(FORCE, self.force.read())
 
     def _drain(self, sink: Sink) -> None:
-        if self._streaming is not None:
-            sink.add_events(self._streaming.read())
-            sink.add_event_pulses(self._streaming.read_pulses())
+        for stream in self._reading:
+            stream.drain(sink)
         poses = self.arm.read_poses()
         if not (np.isfinite(poses.xyz_mm).all() and np.isfinite(poses.rotvec_deg).all()):
             raise ArmFault("arm", "reports poses that are not finite; check its controller's state")
-        sink.add_poses(poses)
-        sink.add_arm_pulses(self.arm.read_pulses())
-        sink.add_sync_pulses(self.sync.read_pulses())
-        if self.frame_camera is not None:
-            sink.add_frames(self.frame_camera.read())
+        sink.add("arm", poses)
+        sink.add("arm", self.arm.read_pulses())
+        sink.add("sync_box", self.sync.read_pulses())
         if self.timing.frames == "exposure line":
-            sink.add_exposures(self.sync.read_exposures())
+            sink.add("sync_box", ExposureChunk(self.sync.read_exposures().t_ns))
         if self._through_host:
-            sink.add_box_reads(self.sync.read_clock())
-        if self.timing.frames == "device time stamps" and self.frame_camera is not None:
-            sink.add_frame_camera_reads(self.frame_camera.read_clock())
+            sink.add("sync_box", self.sync.read_clock())
         if (forces := self._forces or self.force) is not None:
-            sink.add_stream(FORCE, forces.read())
-        for device in self._reading:
-            device.drain(sink)
+            sink.add(FORCE, forces.read())
 
     def begin_trial(
         self, home: Position, seed: int, nuisances: TrialNuisances | None = None

@@ -21,13 +21,12 @@ from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, Truth
-from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.driver import EventCameraDriver
 from sliplab.rigs.core.library_process import PipeCalls
-from sliplab.rigs.core.registry import find_driver
-from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import EventStream, Stream
 from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.spawn_context import WORKERS
@@ -108,29 +107,28 @@ class Loopback:
             self._process.join(END_S)
         self._frames.close()
 
-    def reached_by(self, devices: DeviceSettings) -> DeviceSettings:
-        """Return the settings for drivers to reach these fakes."""
-        camera, box = devices.event_camera_driver.reach, devices.sync_box_driver.reach
-        assert camera is not None  # the rig file was held against it
-        assert box is not None
-        update = {
-            "event_camera": camera(devices.event_camera, self.event_address),
-            "sync_box": box(devices.sync_box, self.sync_address),
+    def reached_by(self, file: RigFile) -> RigFile:
+        """Return a rig file whose drivers reach these fakes."""
+        devices = file.devices
+        assert devices is not None
+        reached = {
+            name: driver.reach(getattr(devices, name), address)
+            for name, driver, address in (
+                ("event_camera", devices.event_camera_driver, self.event_address),
+                ("sync_box", devices.sync_box_driver, self.sync_address),
+                ("force_sensor", devices.force_sensor_driver, self.force_address),
+                ("gripper", devices.gripper_driver, self.gripper_address),
+            )
+            if driver is not None and driver.reach is not None
         }
-        force = devices.force_sensor_driver
-        if force is not None and force.reach is not None and devices.force_sensor is not None:
-            update["force_sensor"] = force.reach(devices.force_sensor, self.force_address)
-        gripper = devices.gripper_driver
-        if gripper is not None and gripper.reach is not None and devices.gripper is not None:
-            update["gripper"] = gripper.reach(devices.gripper, self.gripper_address)
-        return devices.model_copy(update=update)
-
-    def reached_stream(self, name: str, settings: DriverSettings) -> DriverSettings:
-        """Return the settings for the driver of a further event camera to reach its fake."""
-        reach = find_driver(settings.driver, EventCameraDriver).reach
-        assert reach is not None  # the rig file was checked against it
-        found: DriverSettings = reach(settings, self.stream_addresses[name])
-        return found
+        streams: dict[str, Stream] = {}
+        for name, stream in file.streams.items():
+            assert isinstance(stream.driver, EventCameraDriver)  # the file was held against it
+            assert stream.driver.reach is not None
+            device = stream.driver.reach(stream.device, self.stream_addresses[name])
+            streams[name] = stream.model_copy(update={"device": device})
+        changes = {"devices": devices.model_copy(update=reached), "streams": streams}
+        return file.model_copy(update=changes)
 
     def _take(self, addresses: Addresses) -> None:
         self.sync_address, self.event_address, self.force_address = addresses[:3]

@@ -35,7 +35,7 @@ from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
-from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.loopback.tool_load import ToolLoad
 from sliplab.rigs.mock.clocks import trial_clocks

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
 from sliplab.protocols.nuisances import TrialNuisances
-from sliplab.protocols.timing import FrameGrade, StreamTiming, Timing
+from sliplab.protocols.timing import FrameGrade, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
 from sliplab.rigs.mock.fault_kinds import CabledDevice, DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
-from sliplab.rigs.mock.further_settings import Further, FurtherEventCamera, FurtherFrameCamera
+from sliplab.rigs.mock.further_settings import FurtherEventCamera, FurtherFrameCamera, Thermometer
 from sliplab.rigs.mock.gripper import MockGripper
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator, VirtualClock
@@ -30,6 +30,7 @@ from sliplab.rigs.mock.sync import ExposureLine, FreeRun, MockSyncBox
 from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.truth import clocks_of, readings_of, truth_of
 from sliplab.rigs.mock.world import SimulatedWorld
+from sliplab.rigs.stream_settings import ScalarStream, Stream
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.streams import Sink
 
@@ -153,13 +154,13 @@ class MockDevices:
 def build_mock(
     settings: MockSettings,
     timing: Timing | None = None,
-    further: Mapping[str, tuple[Further, StreamTiming, str]] | None = None,
+    further: Mapping[str, Stream] | None = None,
 ) -> MockDevices:
     """Build the devices of a simulated rig. The same settings give the same rig.
 
     Args:
         timing: signals that reach each device; all if left out.
-        further: settings, timing and unit of each further device, by the name of its stream.
+        further: settings of each further device, by the name of its stream.
     """
     timing = timing or Timing()
     world = SimulatedWorld(settings)
@@ -189,29 +190,25 @@ def build_mock(
         force=force,
         gripper=gripper,
         further={
-            name: on_stream_cable(_further(name, *one, world, sync), name, world)
-            for name, one in (further or {}).items()
+            name: on_stream_cable(_further(name, stream, world, sync), name, world)
+            for name, stream in (further or {}).items()
         },
     )
 
 
-def _further(
-    name: str,
-    settings: Further,
-    timing: StreamTiming,
-    unit: str,
-    world: SimulatedWorld,
-    box: MockSyncBox,
-) -> FurtherDevice:
-    """Build a further device; its stream's unit is that of a scalar sensor."""
+def _further(name: str, stream: Stream, world: SimulatedWorld, box: MockSyncBox) -> FurtherDevice:
+    """Build a further device."""
+    settings = stream.mock
     if isinstance(settings, FurtherEventCamera):
         seen = Identity[MockEventCameraSettings](name, settings, settings.clock_ppm, settings.seed)
         return MockEventCamera(world, box, seen)
     if isinstance(settings, FurtherFrameCamera):
         own = Identity[MockFrameCameraSettings](name, settings, settings.clock_ppm, settings.seed)
-        grade = cast(FrameGrade, timing.grade)  # checked against those of its kind
+        grade = cast(FrameGrade, stream.timing.grade)  # checked against those of its kind
         trigger = box if grade == "hardware trigger" else FreeRun(world, own)
         return MockFrameCamera(world, trigger, grade, own)
     if isinstance(settings, MockForceSensorSettings):
         return MockForceSensor(world, settings, name)
-    return MockThermometer(world, settings, name, unit)
+    assert isinstance(settings, Thermometer)
+    assert isinstance(stream, ScalarStream)
+    return MockThermometer(world, settings, name, stream.unit)

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from sliplab.protocols.yaml_file import StrictModel
+from sliplab.protocols.key_errors import KeyedError
 from sliplab.rigs.mock.settings import (
     Finite,
+    FurtherDevice,
     MockEventCameraSettings,
-    MockForceSensorSettings,
     MockFrameCameraSettings,
     NonNegative,
     Positive,
     Seed,
 )
 
+if TYPE_CHECKING:
+    from sliplab.rigs.stream_settings import FrameStream
+
 Ppm = Annotated[float, Field(ge=0, le=20_000)]
 
 
-class FurtherEventCamera(MockEventCameraSettings):
+class FurtherEventCamera(MockEventCameraSettings, FurtherDevice):
     """A further event camera in the sensor; it sees the same markers."""
 
     seed: Seed | None = None
@@ -29,15 +33,34 @@ class FurtherEventCamera(MockEventCameraSettings):
     """Largest drift of its clock, either way."""
 
 
-class FurtherFrameCamera(MockFrameCameraSettings):
+class FurtherFrameCamera(MockFrameCameraSettings, FurtherDevice):
     """A further camera that looks through the plate."""
 
     seed: Seed | None = None
     clock_ppm: Ppm = 20.0
     """Largest drift of its clock, either way."""
 
+    @property
+    def frame_source(self) -> str:
+        """Output of the camera: ``video`` or ``tracks``."""
+        return self.level
 
-class Thermometer(StrictModel):
+    def stream_faults(self, stream: FrameStream) -> Iterator[KeyedError]:
+        """Return what the camera cannot show, and what is worse than its timing states."""
+        yield from super().stream_faults(stream)
+        for side, px in zip(("width", "height"), stream.region_px, strict=True):
+            if px > getattr(self, side):
+                text = f"exceeds mock.{side} = {getattr(self, side)}"
+                yield KeyedError(".region_px", list(stream.region_px), text)
+        if stream.scale_px_per_mm != self.px_per_mm:
+            text = f"must be mock.px_per_mm = {self.px_per_mm:g}"
+            yield KeyedError(".scale_px_per_mm", stream.scale_px_per_mm, text)
+        if stream.rate_hz is not None and stream.rate_hz != self.rate_hz:
+            text = f"must be mock.rate_hz = {self.rate_hz:g}"
+            yield KeyedError(".rate_hz", stream.rate_hz, text)
+
+
+class Thermometer(FurtherDevice):
     """A body that cools to its surroundings by Newton's law, and a digital thermometer on it.
 
     The trial draws the temperature that the body begins with.
@@ -57,6 +80,3 @@ class Thermometer(StrictModel):
     """From a reading to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 2000.0
     """Delay besides; half-normal, up to this limit of four sigma."""
-
-
-Further = FurtherEventCamera | FurtherFrameCamera | MockForceSensorSettings | Thermometer

@@ -8,18 +8,27 @@ on a real skin, and everything computed from them is simulated.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.nuisances import FlickerNuisance
+from sliplab.protocols.plan import Plan
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
 from sliplab.protocols.yaml_file import StrictModel, rule
-from sliplab.rigs.mock.fault_kinds import Fault, check_papillae, check_single
+from sliplab.rigs.core.gripper_range import GripperRange
+from sliplab.rigs.core.sections import SimulatedRig, SimulatedStream
+from sliplab.rigs.mock.fault_kinds import Fault, StreamGone, check_papillae, check_single
 
 if TYPE_CHECKING:
+    from sliplab.rigs.rig_file import RigFile
     from sliplab.rigs.scene import skin as scene_skin
 
+SCALE_ERROR = 0.005
+"""Largest relative error of a measured scale."""
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, lt=1)]
@@ -308,10 +317,25 @@ class MockArmSettings(StrictModel):
     """Position of the arm at power-on; 60 mm clear of the plate if left out."""
 
 
+class FurtherDevice(SimulatedStream):
+    """A simulated further device, which has a clock and delays of its own."""
+
+    def stream_faults(self, stream: Any) -> Iterator[KeyedError]:
+        """Return what is worse than the stream's timing states."""
+        timing = stream.timing
+        clock_ppm = getattr(self, "clock_ppm", 0.0)
+        yield from _at_most(".mock.clock_ppm", clock_ppm, "timing.drift_ppm", timing.drift_ppm)
+        if timing.grade == "arm clock":
+            text = "must be host time: the simulated sensor has its own clock"
+            yield KeyedError(".timing.grade", timing.grade, text)
+        if timing.grade in {"host arrival", "host time"}:
+            yield from _delay_faults(self, timing.delay, ".mock", "timing.delay")
+
+
 Row = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
-class MockForceSensorSettings(StrictModel):
+class MockForceSensorSettings(FurtherDevice):
     """A force/torque sensor behind the plate: the contact's true forces, and its own faults.
 
     Axes: x right, y up, z into the plate; torques are about the plate's centre. The defaults are
@@ -412,7 +436,7 @@ class ClockErrors(StrictModel):
         return self
 
 
-class MockSettings(StrictModel):
+class MockSettings(SimulatedRig):
     """A simulated rig."""
 
     seed: Seed = 1
@@ -435,6 +459,69 @@ class MockSettings(StrictModel):
         check_single(self.faults, self.event_camera.cutoff_hz)
         return self
 
+    @property
+    def has_force(self) -> bool:
+        """True if there is a force sensor."""
+        return self.force is not None
+
+    @property
+    def gripper_range(self) -> GripperRange | None:
+        """Values that the gripper's commands may have; None without a gripper."""
+        made = self.gripper
+        return made if made is None else GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
+
+    @property
+    def grip_opening_mm(self) -> float | None:
+        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
+        return None if self.gripper is None else self.gripper.opening_mm
+
+    @property
+    def frame_source(self) -> str:
+        """Output of the outside camera: ``video`` or ``tracks``."""
+        return self.frame_camera.level
+
+    @property
+    def block_ms(self) -> int:
+        """Duration of the blocks that the event camera sends."""
+        return self.event_camera.block_ms
+
+    def rig_faults(self, rig: RigFile) -> Iterator[KeyedError]:
+        """Return where the simulated devices are not those that the rig file states."""
+        for name, stream in rig.streams.items():
+            jitter = {"events": "pulse_jitter_us", "frames": "frame_jitter_us"}.get(stream.kind)
+            if jitter is None or stream.timing.grade == "host arrival":
+                continue
+            limit = f"streams.{name}.timing.jitter_us", stream.timing.jitter_us
+            yield from _at_most(f"mock.clocks.{jitter}", getattr(self.clocks, jitter), *limit)
+        for index, fault in enumerate(self.faults):
+            if isinstance(fault, StreamGone) and fault.stream not in rig.streams:
+                known = ", ".join(rig.streams) or "none"
+                text = f"is no further device of the rig; it has: {known}"
+                yield KeyedError(f"mock.faults[{index}].stream", fault.stream, text)
+        camera, stated = self.frame_camera, rig.frame_camera
+        if abs(stated.scale_px_per_mm - camera.px_per_mm) > SCALE_ERROR * camera.px_per_mm:
+            text = f"must be mock.frame_camera.px_per_mm = {camera.px_per_mm:g}"
+            yield KeyedError("frame_camera.scale_px_per_mm", stated.scale_px_per_mm, text)
+        if stated.rate_hz is not None and camera.rate_hz != stated.rate_hz:
+            text = f"must be mock.frame_camera.rate_hz = {camera.rate_hz:g}"
+            yield KeyedError("frame_camera.rate_hz", stated.rate_hz, text)
+        sensor = None if rig.devices is None else rig.devices.force_sensor_driver
+        yield from _timing_faults(self, rig.timing, sensor is not None and sensor.of_arm)
+
+    def plan_faults(self, plan: Plan, file: str) -> Iterator[InputError]:
+        """Check that the pixels can see a flickering light, if the plan has one."""
+        cutoff_hz = self.event_camera.cutoff_hz
+        for trial in plan if cutoff_hz else ():
+            if any(isinstance(each, FlickerNuisance) for each in plan.program(trial).nuisances):
+                yield InputError(
+                    file,
+                    "mock.event_camera.cutoff_hz",
+                    cutoff_hz,
+                    f"must be 0 for the flicker of trial {trial.id} of {plan.file}: behind a low "
+                    "pass it is not computed",
+                )
+                return
+
 
 def skin_of(settings: MockSettings) -> scene_skin.Skin:
     """Return the skin of a simulated rig."""
@@ -456,85 +543,51 @@ def skin_of(settings: MockSettings) -> scene_skin.Skin:
     return scene_skin.make_skin(geometry, seed, measured)
 
 
-def check_timing(mock: MockSettings, timing: Timing, force_of_arm: bool = False) -> None:
-    """Check a simulated rig's clocks and delays against `timing`.
+def _timing_faults(mock: MockSettings, timing: Timing, force_of_arm: bool) -> Iterator[KeyedError]:
+    """Return the clocks and delays of a simulated rig that are worse than `timing` states.
 
     Args:
         force_of_arm: forces come with the arm's poses, by its clock.
-
-    Raises:
-        KeyedError: the first setting beyond it.
     """
-    for device, drift, jitters in (
-        ("sync_box", "sync_box_ppm", _jitters("exposure", timing.frames == "exposure line")),
-        ("event_camera", "event_camera_ppm", _jitters("pulse", True)),
-        ("frame_camera", "frame_camera_ppm", _jitters("frame", timing.frames != "host arrival")),
-        ("arm_controller", "arm_ppm", _jitters("pulse", timing.arm == "digital input")),
+    for device, drift, jitter, used in (
+        ("sync_box", "sync_box_ppm", "exposure", timing.frames == "exposure line"),
+        ("event_camera", "event_camera_ppm", "pulse", True),
+        ("frame_camera", "frame_camera_ppm", "frame", timing.frames != "host arrival"),
+        ("arm_controller", "arm_ppm", "pulse", timing.arm == "digital input"),
     ):
-        promised = getattr(timing, device)
-        for name, key in ((drift, "drift_ppm"), *((jitter, "jitter_us") for jitter in jitters)):
-            value, limit = getattr(mock.clocks, name), getattr(promised, key)
-            if value > limit:
-                raise KeyedError(
-                    f"mock.clocks.{name}",
-                    value,
-                    f"must be at most timing.{device}.{key} = {limit:g}",
-                )
+        limits = [(drift, "drift_ppm"), (f"{jitter}_jitter_us", "jitter_us")][: 1 + used]
+        for name, key in limits:
+            limit = f"timing.{device}.{key}", getattr(getattr(timing, device), key)
+            yield from _at_most(f"mock.clocks.{name}", getattr(mock.clocks, name), *limit)
     if timing.frames == "host arrival":
-        camera = mock.frame_camera
-        _check_delay(
-            "frame_camera",
-            camera.latency_us,
-            camera.arrival_jitter_us,
-            "frame_delay",
-            timing.frame_delay,
-        )
+        camera, delay = mock.frame_camera, timing.frame_delay
+        yield from _delay_faults(camera, delay, "mock.frame_camera", "timing.frame_delay")
     if mock.force is not None and not force_of_arm:
-        _check_force(mock.force, timing)
+        how = timing.force or ForceTiming()
+        if how.grade != "host time":
+            text = "must be host time: the simulated sensor has a clock"
+            yield KeyedError("timing.force.grade", how.grade, text)
+        limit = "timing.force.drift_ppm", how.drift_ppm
+        yield from _at_most("mock.force.clock_ppm", mock.force.clock_ppm, *limit)
+        yield from _delay_faults(mock.force, how.delay, "mock.force", "timing.force.delay")
     if timing.arm == "host time":
-        _check_delay(
-            "arm",
-            mock.arm.latency_us,
-            mock.arm.arrival_jitter_us,
-            "pose_delay",
-            timing.pose_delay,
+        yield from _delay_faults(mock.arm, timing.pose_delay, "mock.arm", "timing.pose_delay")
+
+
+def _at_most(key: str, value: float, name: str, limit: float) -> Iterator[KeyedError]:
+    if value > limit:
+        yield KeyedError(key, value, f"must be at most {name} = {limit:g}")
+
+
+def _delay_faults(device: Any, delay: Delay, key: str, name: str) -> Iterator[KeyedError]:
+    """Return what of a device's delay is beyond the one of its timing, at `name`."""
+    latency_us, jitter_us = device.latency_us, device.arrival_jitter_us
+    if latency_us < delay.shortest_us:
+        text = f"must be at least {name}.shortest_us = {delay.shortest_us:g}"
+        yield KeyedError(f"{key}.latency_us", latency_us, text)
+    if latency_us + jitter_us > delay.longest_us:
+        text = (
+            f"must be at most {delay.longest_us - latency_us:g}: with latency_us, "
+            f"{name}.longest_us = {delay.longest_us:g}"
         )
-
-
-def _check_force(force: MockForceSensorSettings, timing: Timing) -> None:
-    """Hold a simulated force sensor's clock and delay against `timing.force`."""
-    how = timing.force or ForceTiming()
-    if how.grade != "host time":
-        raise KeyedError(
-            "timing.force.grade", how.grade, "must be host time: the simulated sensor has a clock"
-        )
-    if force.clock_ppm > how.drift_ppm:
-        raise KeyedError(
-            "mock.force.clock_ppm",
-            force.clock_ppm,
-            f"must be at most timing.force.drift_ppm = {how.drift_ppm:g}",
-        )
-    _check_delay("force", force.latency_us, force.arrival_jitter_us, "force.delay", how.delay)
-
-
-def _jitters(stream: str, used: bool) -> tuple[str, ...]:
-    """Return the jitter settings that affect this rig's time stamps."""
-    return (f"{stream}_jitter_us",) if used else ()
-
-
-def _check_delay(
-    device: str, latency_us: float, jitter_us: float, name: str, promised: Delay
-) -> None:
-    if latency_us < promised.shortest_us:
-        raise KeyedError(
-            f"mock.{device}.latency_us",
-            latency_us,
-            f"must be at least timing.{name}.shortest_us = {promised.shortest_us:g}",
-        )
-    if latency_us + jitter_us > promised.longest_us:
-        raise KeyedError(
-            f"mock.{device}.arrival_jitter_us",
-            jitter_us,
-            f"must be at most {promised.longest_us - latency_us:g}: with latency_us, "
-            f"timing.{name}.longest_us = {promised.longest_us:g}",
-        )
+        yield KeyedError(f"{key}.arrival_jitter_us", jitter_us, text)

@@ -49,7 +49,7 @@ from sliplab.storage.formats.foreign import (
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
 from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, MotionStep
-from sliplab.storage.streams import Json, StreamChunk
+from sliplab.storage.streams import Chunk, Json
 from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, Store
 
 GIVEN, UNKNOWN = "given", "unknown"
@@ -328,9 +328,9 @@ class _Opening:
             self.found.folder, self._names(FRAMES), self._names(FRAME_TIMES), part, paths
         )
 
-    def _streams(self) -> dict[str, StreamChunk]:
+    def _streams(self) -> dict[str, Chunk]:
         parts = self.found.adapter.streams
-        chunks: dict[str, StreamChunk] = {}
+        chunks: dict[str, Chunk] = {}
         for kind, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
             for name, part in named.items():
                 if self._names(key := f"{kind}.{name}"):

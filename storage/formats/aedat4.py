@@ -41,7 +41,6 @@ from sliplab.storage.formats.foreign import (
     empty_events,
     event_chunk,
     grey,
-    part_of,
 )
 from sliplab.storage.formats.format import Format
 from sliplab.storage.kernels import njit
@@ -225,22 +224,22 @@ class Aedat4File:
             words = _event_words(data)
             count = len(words) // 2
             if filled and filled + count > len(room):
-                yield part_of(room, 0, filled)
+                yield room[:filled]
                 filled = 0
                 room = empty_events(_PACKET_EVENTS)
             if count > len(room):
                 room = empty_events(count)
-            found = _split(words, part_of(room, filled, filled + count))
+            found = _split(words, room[filled : filled + count])
             if len(found) == count:
                 filled += count
                 continue
             if filled:
-                yield part_of(room, 0, filled)
+                yield room[:filled]
                 filled = 0
                 room = empty_events(_PACKET_EVENTS)
             yield found
         if filled:
-            yield part_of(room, 0, filled)
+            yield room[:filled]
 
     def triggers(self, number: int) -> Triggers:
         """Return all triggers of a stream."""
@@ -438,7 +437,7 @@ class Aedat4Writer:
     def events(self, number: int, chunk: EventChunk) -> None:
         """Append events; times must not run backwards, over all calls."""
         for start in range(0, len(chunk), _PACKET_EVENTS):
-            self._write(number, events_buffer(part_of(chunk, start, start + _PACKET_EVENTS)))
+            self._write(number, events_buffer(chunk[start : start + _PACKET_EVENTS]))
 
     def triggers(self, number: int, found: Triggers) -> None:
         """Append triggers."""

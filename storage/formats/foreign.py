@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -17,12 +17,12 @@ from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, MotionStep, 
 from sliplab.storage.streams import (
     I64,
     U8,
+    Chunk,
     EventChunk,
     FrameChunk,
     Json,
     PoseChunk,
     ScalarChunk,
-    StreamChunk,
     WrenchChunk,
 )
 from sliplab.storage.trials.store import Campaign, Store
@@ -231,7 +231,7 @@ class ForeignTrial:
     packets: int | None = None
     salvage: Callable[[], ForeignTrial] | None = None
     poses: PoseChunk | None = None
-    streams: Mapping[str, StreamChunk] = field(default_factory=dict)
+    streams: Mapping[str, Chunk] = field(default_factory=dict)
     left_out: Mapping[str, int] = field(default_factory=dict)
     resolution_us: Mapping[str, float] = field(default_factory=dict)
     notes: Callable[[], tuple[str, ...]] = tuple
@@ -315,12 +315,6 @@ def empty_events(count: int) -> EventChunk:
     )
 
 
-def part_of(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    """Return events low to high, the last one not included, without a copy."""
-    part = slice(low, high)
-    return EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-
-
 def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
     """Return a chunk without the events outside of the size that their file gives its camera."""
     if size is None or not len(chunk):
@@ -338,13 +332,6 @@ def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
 def left_out_of(chunk: EventChunk) -> Mapping[str, int]:
     """Return the numbers of events that were left out of a chunk, by reason."""
     return chunk.left_out if isinstance(chunk, ForeignChunk) else {}
-
-
-def some_rows(chunk: ChunkT, good: Any) -> ChunkT:
-    """Return some rows of a chunk: of each of its arrays."""
-    values = {item.name: getattr(chunk, item.name) for item in fields(chunk)}
-    arrays = {key: value[good] for key, value in values.items() if isinstance(value, np.ndarray)}
-    return replace(chunk, **arrays)
 
 
 def resolution_us(times: Any, per_unit: float, whole_us: float = 0.0) -> float:

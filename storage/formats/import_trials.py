@@ -14,7 +14,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import faults_of
 from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
@@ -45,13 +46,11 @@ from sliplab.storage.formats.foreign import (
     inside,
     left_out_of,
     refusal,
-    some_rows,
 )
 from sliplab.storage.formats.recognition import before_damage
 from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
-from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
     DeviceRecord,
     Gate,
@@ -68,13 +67,13 @@ from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
     I64,
+    Chunk,
     EventChunk,
     FrameChunk,
     Json,
-    PoseChunk,
     PulseChunk,
     ScalarChunk,
-    WrenchChunk,
+    TriggerChunk,
 )
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
 from sliplab.storage.trials.writer import TrialWriter
@@ -93,7 +92,7 @@ _MOST_RATE, _FEW = 1e8, 100
 """Events a second that no camera sends; of fewer events the rate says nothing."""
 _MOST_ALIKE = 1000
 """Events for each distinct time, in the mean, from which on times carry too little information."""
-SampleT = TypeVar("SampleT", bound=PoseChunk | WrenchChunk | ScalarChunk)
+SampleT = TypeVar("SampleT", bound=Chunk)
 _UNKNOWN = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
 
 
@@ -492,7 +491,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> DataSp
         retained = content.ordered(EVENTS_KIND, chunk.t_us, done, last_us)
         done += len(chunk)
         if not isinstance(retained, slice):
-            chunk = some_rows(chunk, retained)
+            chunk = chunk[retained]
         if not len(chunk):
             continue
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
@@ -502,7 +501,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> DataSp
         if int(steps[widest]) > gap_us:
             gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
         last_us = int(chunk.t_us[-1])
-        writer.add_events(chunk)
+        writer.add("events", chunk)
         content.rows[EVENTS_KIND] += len(chunk)
     content.check_majority(EVENTS_KIND, done)
     content.check_order(EVENTS_KIND, content.rows[EVENTS_KIND], done)
@@ -511,9 +510,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial, content: _Content) -> DataSp
     _fill_triggers(writer, trial, content)
     times = None
     if trial.frames is not None:
-        times, _ = _fill_frames(
-            FRAMES_KIND, trial.frames, trial.frame_px, content, writer.add_frames
-        )
+        times, _ = _fill_frames(FRAMES_KIND, trial.frames, trial.frame_px, content, writer)
         content.check_times(FRAMES_KIND, times, trial.resolution_us.get(FRAMES_KIND, 0.0))
     events = None if first_us is None or last_us is None else (first_us, last_us)
     if events is not None:
@@ -533,9 +530,9 @@ def _fill_triggers(writer: TrialWriter, trial: ForeignTrial, content: _Content) 
     t_us, kind = t_us[good], kind[good]
     retained = in_order(t_us)
     content.leave_out(f"triggers {BACK}", int((~retained).sum()))
-    t_ns, kind = t_us[retained] * 1000, kind[retained]
-    writer.add_triggers(t_ns, kind)
-    writer.add_event_pulses(PulseChunk(t_ns[kind == RISING]))
+    found = TriggerChunk(t_us[retained] * 1000, kind[retained])
+    writer.add(EVENTS_KIND, found)
+    writer.add(EVENTS_KIND, PulseChunk(found.t_ns[found.kind == RISING]))
 
 
 def _frames(
@@ -557,7 +554,7 @@ def _frames(
         if not good.all():
             what = _rows_of(stream)
             content.leave_out(NO_TIME.format(what), int((~good).sum()))
-            chunk = some_rows(chunk, good)
+            chunk = chunk[good]
         if len(chunk):
             yield chunk
 
@@ -567,7 +564,7 @@ def _fill_frames(
     read: Callable[[], Iterator[FrameChunk]],
     size: tuple[int, int] | None,
     content: _Content,
-    write: Callable[[FrameChunk], None],
+    writer: TrialWriter,
 ) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
     """Write the frames of a camera; return their first and last time, ns, and their size."""
     ends: tuple[int, int] | None = None
@@ -576,11 +573,11 @@ def _fill_frames(
     for chunk in _frames(stream, read, size, content):
         retained = content.ordered(stream, chunk.t_ns, done, None if ends is None else ends[1])
         done += len(chunk)
-        chunk = chunk if isinstance(retained, slice) else some_rows(chunk, retained)
+        chunk = chunk if isinstance(retained, slice) else chunk[retained]
         if not len(chunk):
             continue
         size = size or (chunk.images.shape[2], chunk.images.shape[1])
-        write(chunk)
+        writer.add(stream, chunk)
         content.rows[stream] += len(chunk)
         last = chunk.t_ns[0] - 1 if ends is None else ends[1]
         repeated += int((np.diff(chunk.t_ns, prepend=last) == 0).sum())
@@ -604,17 +601,17 @@ def _fill_further(
 ) -> dict[str, StreamRecord]:
     """Write poses, named streams and further cameras; return what the record says of them."""
     if trial.poses is not None:
-        writer.add_poses(_samples("poses", trial.poses, trial, content))
+        writer.add("arm", _samples("poses", trial.poses, trial, content))
     found: dict[str, StreamRecord] = {}
     for name, chunk in trial.streams.items():
         chunk = _samples(name, chunk, trial, content)
-        writer.add_stream(name, chunk)
-        said = StreamRecord(kind=chunk.KIND, rows=len(chunk))
+        writer.add(name, chunk)
+        about: dict[str, Any] = {"kind": chunk.KIND.name, "rows": len(chunk)}
         if isinstance(chunk, ScalarChunk) and chunk.unit:
-            said = StreamRecord(kind=chunk.KIND, rows=len(chunk), unit=chunk.unit)
-        found[name] = said
+            about["unit"] = chunk.unit
+        found[name] = StreamRecord(**about)
     for name, read in trial.cameras.items():
-        ends, size = _fill_frames(name, read, None, content, partial(writer.add_stream, name))
+        ends, size = _fill_frames(name, read, None, content, writer)
         content.check_times(name, ends, trial.resolution_us.get(name, 0.0))
         found[name] = StreamRecord(kind=FRAMES_KIND, rows=content.rows[name], size_px=size)
     return found
@@ -623,9 +620,9 @@ def _fill_further(
 def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) -> SampleT:
     """Return the rows of poses, forces or readings that can be right, in order of time."""
     what = _rows_of(name)
-    good = np.abs(chunk.t_ns // 1000) < LATEST_US
+    good = np.abs(chunk.times // 1000) < LATEST_US
     content.leave_out(NO_TIME.format(what), int((~good).sum()))
-    values = [getattr(chunk, each.name) for each in fields(chunk)]
+    values = vars(chunk).values()
     numbers = [value for value in values if getattr(value, "dtype", None) == np.float64]
     finite = np.ones(len(chunk), np.bool_)
     for value in numbers:
@@ -634,15 +631,15 @@ def _samples(name: str, chunk: SampleT, trial: ForeignTrial, content: _Content) 
     good &= finite
     content.check_majority(name, int(good.sum()))
     if not good.all():
-        chunk = some_rows(chunk, good)
-    retained = in_order(chunk.t_ns)
+        chunk = chunk[good]
+    retained = in_order(chunk.times)
     if not retained.all():
         content.leave_out(f"{what} {BACK}", int((~retained).sum()))
         content.check_order(name, int(retained.sum()), len(retained))
-        chunk = some_rows(chunk, retained)
+        chunk = chunk[retained]
     content.rows[name] = len(chunk)
     if len(chunk):
-        ends = int(chunk.t_ns[0]), int(chunk.t_ns[-1])
+        ends = int(chunk.times[0]), int(chunk.times[-1])
         content.check_times(name, ends, trial.resolution_us.get(name, 0.0))
         content.further_ns[name] = ends
     return chunk
@@ -757,5 +754,5 @@ def _record(
     try:
         return TrialRecord.model_validate(values)
     except ValidationError as error:
-        key, value, expected = first_fault(error)
-        raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None
+        fault = faults_of(TrialRecord, error)[0]
+        raise FormatError(f"holds {fault.key} = {fault.value!r:.60}, which {fault}") from None

@@ -9,7 +9,6 @@ byte.
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
@@ -25,6 +24,7 @@ from pydantic import Field as _Field
 from pydantic_core.core_schema import no_info_plain_validator_function
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import faults_of
 from sliplab.storage.files import read_json
 
 if TYPE_CHECKING:  # loads numpy
@@ -128,39 +128,6 @@ class Document(Part):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            key, value, expected = first_fault(error)
-            raise DocumentError(InputError(path, key, value, expected).message) from None
-
-
-def first_fault(error: ValidationError) -> tuple[str, Any, str]:
-    """Return key, value and what would be right, of the first fault of a document."""
-    first = error.errors(include_url=False)[0]
-    # of a union, pydantic names the branch too
-    place = [part for part in first["loc"] if not str(part).startswith("function-")]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
-    kind, value = first["type"], first["input"]
-    if kind == "missing":
-        value, expected = None, "is missing"
-    elif kind == "value_error":
-        expected = str(first["ctx"]["error"])
-    else:
-        message = re.sub("^Input should", "must", first["msg"])
-        expected = _EXPECTED.get(kind, message[0].lower() + message[1:])
-        value = "null" if value is None else value
-    return key.removeprefix("."), value, expected
-
-
-_MAPPING = "must be a mapping"
-_EXPECTED = {
-    "string_type": "must be text",
-    "tuple_type": "must be a list",
-    "list_type": "must be a list",
-    "dict_type": _MAPPING,
-    "model_type": _MAPPING,
-    "model_attributes_type": _MAPPING,
-    "int_type": "must be a whole number",
-    "bool_type": "must be true or false",
-    "greater_than_equal": "must fit 64 bits",
-    "less_than": "must fit 64 bits",
-}
-"""By pydantic's kinds of error."""
+            fault = faults_of(cls, error)[0]
+            wrong = InputError(path, fault.key, fault.value, str(fault))
+            raise DocumentError(wrong.message) from None

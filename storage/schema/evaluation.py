@@ -570,7 +570,8 @@ class Evaluation(Document):
 
 
 class OtherEvaluation(Document):
-    """Results that `evaluate` keeps of another network: of `analysis.also`, or of `--model`."""
+    """Results that `evaluate` keeps of another network: of `analysis.also`, `--model`, or
+    `--predictions`."""
 
     key: str = ""
     data_key: str | None = None
@@ -578,7 +579,7 @@ class OtherEvaluation(Document):
     title: str
     """The network as text."""
     engine: str
-    """Engine that counted its spikes: `fast` or `sinabs`."""
+    """Engine that counted its spikes: `fast`, `sinabs`, or `predictions` of another program."""
     exact: Bool
     """Both give the same counts by arithmetic."""
     preset: str | None

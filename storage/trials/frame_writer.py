@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.storage.streams import U8, FrameChunk
+from sliplab.storage.streams import FRAMES, U8, FrameChunk
 from sliplab.storage.trials.hdf5_writer import StreamFile
 from sliplab.storage.trials.video import VideoWriter
 
@@ -48,23 +48,22 @@ class FrameWriter:
         size_px: tuple[int, int] | None = None,
     ) -> None:
         self._streams, self._path, self._rate_hz = streams, video, rate_hz
-        self._size_px = size_px
-        self._spool = Spool(spool) if spool is not None else None
+        self._size_px, self._raw = size_px, spool
+        self._spool: Spool | None = None
         self._video: VideoWriter | None = None
 
     def add(self, chunk: FrameChunk) -> None:
         """Append frames, or the tracks in place of them, and their times."""
         if not len(chunk):
             return
-        self._streams.append(
-            "frames", number=chunk.number, t=chunk.t_ns, host=chunk.host_ns, sync=chunk.sync
-        )
+        self._streams.add(FRAMES.name, chunk)
         if chunk.markers_px is not None:
             self._streams.add_tracks(chunk)
             return
         if self._size_px is None:
             self._size_px = chunk.images.shape[2], chunk.images.shape[1]
-        if self._spool is not None:
+        if self._raw is not None:
+            self._spool = self._spool or Spool(self._raw)
             self._spool.write(chunk.images)
         else:
             if self._video is None:

@@ -12,10 +12,11 @@ import math
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import product, repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import hdf5plugin  # noqa: F401  (registers the filters)
@@ -24,7 +25,10 @@ import numpy as np
 from sliplab.storage.errors import StoreError, disk_fault, own_fault
 from sliplab.storage.streams import (
     I64,
+    SCALAR,
+    Chunk,
     ClockReads,
+    Column,
     EventChunk,
     PoseChunk,
     ScalarChunk,
@@ -44,7 +48,6 @@ from sliplab.storage.trials.hdf5_writer import (
     TRACKS,
     UNIT_ATTRIBUTE,
     Array,
-    Kind,
 )
 from sliplab.storage.trials.packed_chunks import Filter, unpacked_bytes
 from sliplab.storage.trials.superblock import HEAD_BYTES, closed
@@ -226,7 +229,7 @@ class RowFile:
         for name in names:
             if not STREAM_NAME.fullmatch(name):
                 raise NotOurs(f"{self.path}: a stream has the name {name!r}")
-        return {name: self._kind(self._group(f"{STREAM_GROUP}/{name}")) for name in names}
+        return {name: self.kind(f"{STREAM_GROUP}/{name}") for name in names}
 
     def _group(self, name: str) -> Any:
         found = h5py.h5o.open(self._file, self._place(name))
@@ -234,11 +237,29 @@ class RowFile:
             raise NotOurs(f"{self.path}: {name} is no group")
         return found
 
-    @staticmethod
-    def _kind(group: Any) -> str:
-        """Return a stream's kind; ``""`` where it says none that is known."""
-        kind = _text(group, KIND_ATTRIBUTE)
-        return kind if kind in STREAMS else ""
+    def kind(self, group: str) -> str:
+        """Return the kind of a named stream by the name of its group; ``""`` where it says none."""
+        with _faults(f"{self.path}: {group}"):
+            kind = _text(self._group(group), KIND_ATTRIBUTE)
+        return kind if STREAM_NAME.fullmatch(kind) else ""
+
+    def parts(self, name: str) -> list[str]:
+        """Return the names of a named stream's columns; of a kind not known here what it has.
+
+        Raises:
+            NotOurs: it has a wrong name, or there are too many.
+        """
+        kind = self.kind(f"{STREAM_GROUP}/{name}")
+        if kind in STREAMS or not kind:
+            return list(STREAMS[kind].columns) if kind else []
+        group = self._group(f"{STREAM_GROUP}/{name}")
+        if group.get_num_objs() > MOST_STREAMS:
+            raise NotOurs(f"{self.path}: stream '{name}' has more than {MOST_STREAMS} columns")
+        found = [part.decode("utf-8", "replace") for part in group]
+        for part in found:
+            if not STREAM_NAME.fullmatch(part):
+                raise NotOurs(f"{self.path}: stream '{name}' has a column {part!r}")
+        return sorted(found)
 
     def unit(self, name: str) -> str:
         """Return the unit of a named stream; ``""`` where it says none."""
@@ -371,24 +392,18 @@ def _text(group: Any, name: str) -> str:
 
 
 _ANY = "integer"
-_POSE = ("t", "host", "xyz", "rotvec")
-_OFFSET: Kind = (_ANY, (), "us")
-_KINDS: dict[str, Kind] = {
+_OFFSET = Column("", _ANY, (), "us")
+_KINDS: dict[str, Column] = {
     **COLUMNS,
     **TRACKS,
     **TIMING,
-    TIMES: (_ANY, (), "us"),
-    INDEX: (_ANY, (), "row"),
+    TIMES: Column("t_us", _ANY, (), "us"),
+    INDEX: Column("", _ANY, (), "row"),
     OFFSET: _OFFSET,
 }
-_STREAM_PARTS = {part: kind for columns in STREAMS.values() for part, (_, kind) in columns.items()}
-
-
-def _kind_of(name: str) -> Kind | None:
-    """Return the kind that a column of a trial must have; None where none is known."""
-    if name.startswith(STREAM_GROUP):
-        return _STREAM_PARTS.get(name.rpartition("/")[2])
-    return _KINDS.get(name)
+_CLOCKS = {part: SCALAR.columns[part] for part in ("t", "host")}
+"""Columns of a named stream of any kind."""
+ChunkT = TypeVar("ChunkT", bound=Chunk)
 
 
 class Hdf5Column:
@@ -417,15 +432,15 @@ class Hdf5Column:
         if filters:
             self._chunk, self._filters = chunk, filters
 
-    def fits(self, kind: Kind) -> bool:
-        """Return whether type and shape are of a kind; of ``integer`` any integers are."""
-        dtype, shape, _ = kind
-        same = self.dtype.kind in "iu" if dtype == _ANY else self.dtype == dtype
-        rest = self.shape[1:] if kind is not _OFFSET else self.shape
+    def fits(self, column: Column) -> bool:
+        """Return whether type and shape are a column's; of ``integer`` any integers are."""
+        shape = column.shape
+        same = self.dtype.kind in "iu" if column.dtype == _ANY else self.dtype == column.dtype
+        rest = self.shape[1:] if column is not _OFFSET else self.shape
         fits = len(rest) == len(shape) and all(
             wanted in {-1, found} for wanted, found in zip(shape, rest, strict=True)
         )
-        return same and fits and (kind is _OFFSET or bool(self.shape))
+        return same and fits and (column is _OFFSET or bool(self.shape))
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -583,11 +598,20 @@ class StreamReader:
             NotOurs: its values are not in this file, or are of another type or shape.
         """
         found = self._file.rows(name)
-        if (kind := _kind_of(name)) is not None and not found.fits(kind):
+        column = self._column_of(name)
+        if not (bool(found.shape) if column is None else found.fits(column)):
             raise NotOurs(
                 f"{self._file.path}: {name} has the type {found.dtype} and the shape {found.shape}"
             )
         return found
+
+    def _column_of(self, name: str) -> Column | None:
+        """Return what a column must be; None where that is not known here."""
+        group, _, part = name.rpartition("/")
+        if not group.startswith(f"{STREAM_GROUP}/"):
+            return _KINDS.get(name)
+        kind = STREAMS.get(self._file.kind(group))
+        return (_CLOCKS if kind is None else kind.columns).get(part)
 
     def event_times(self) -> I64:
         """Return the times of all events on the camera's clock, us."""
@@ -683,10 +707,8 @@ class StreamReader:
 
     def clock_reads(self, group: str) -> ClockReads:
         """Return all of ``box_reads`` or ``frame_camera_reads``; empty without any."""
-        parts = ("t", "before", "after")
-        if all(self.has(f"{group}/{part}") for part in parts):
-            self._group(group, *parts)
-        return ClockReads(*(self._late(f"{group}/{part}") for part in parts))
+        there = any(self.has(f"{group}/{part}") for part in ClockReads.KIND.columns)
+        return self._chunk(ClockReads, group) if there else ClockReads.empty()
 
     def _late(self, name: str) -> I64:
         """Return a column of times; empty if it is one of `TIMING` that was never made."""
@@ -696,7 +718,13 @@ class StreamReader:
 
     def poses(self) -> PoseChunk:
         """Return all arm poses."""
-        return PoseChunk(*(rows.read() for rows in self._group("poses", *_POSE)))
+        return self._chunk(PoseChunk, "poses")
+
+    def _chunk(self, chunk: type[ChunkT], group: str) -> ChunkT:
+        """Return all rows of a group as one chunk."""
+        columns = chunk.KIND.columns
+        rows = self._group(group, *columns)
+        return chunk.from_columns({part: r.read() for part, r in zip(columns, rows, strict=True)})
 
     def streams(self) -> dict[str, str]:
         """Return the kind of every named stream, by name; ``""`` for one that is unknown.
@@ -712,12 +740,7 @@ class StreamReader:
         Raises:
             NotOurs: the stream is of another kind.
         """
-        kind = self._file.streams().get(name)
-        if kind is None:
-            return WrenchChunk.empty()
-        if kind != WrenchChunk.KIND:
-            raise NotOurs(f"{self._file.path}: stream '{name}' is of kind '{kind}', no wrench")
-        return WrenchChunk(**self._fields(name, kind))
+        return self._named(WrenchChunk, name)
 
     def scalars(self, name: str) -> ScalarChunk:
         """Return all readings of a named stream; empty where the trial has none.
@@ -725,20 +748,24 @@ class StreamReader:
         Raises:
             NotOurs: the stream is of another kind.
         """
-        kind = self._file.streams().get(name)
-        if kind is None:
-            return ScalarChunk.empty()
-        if kind != ScalarChunk.KIND:
-            raise NotOurs(f"{self._file.path}: stream '{name}' is of kind '{kind}', no scalar")
-        return ScalarChunk(**self._fields(name, kind), unit=self._file.unit(name))
+        unit = self._file.unit(name) if name in self.streams() else ""
+        return replace(self._named(ScalarChunk, name), unit=unit)
 
-    def _fields(self, name: str, kind: str) -> dict[str, Array]:
-        """Return the columns of a named stream, by the field of its chunks."""
-        columns = self._group(f"{STREAM_GROUP}/{name}", *STREAMS[kind])
-        return {
-            field: rows.read()
-            for rows, (field, _) in zip(columns, STREAMS[kind].values(), strict=True)
-        }
+    def _named(self, chunk: type[ChunkT], name: str) -> ChunkT:
+        kind, wanted = self.streams().get(name), chunk.KIND.name
+        if kind is None:
+            return chunk.empty()
+        if kind != wanted:
+            raise NotOurs(f"{self._file.path}: stream '{name}' is of kind '{kind}', no {wanted}")
+        return self._chunk(chunk, f"{STREAM_GROUP}/{name}")
+
+    def parts(self, name: str) -> list[str]:
+        """Return the names of a named stream's columns.
+
+        Raises:
+            NotOurs: there is no such stream, or one of them is no column.
+        """
+        return self._file.parts(name)
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""
@@ -764,8 +791,7 @@ class StreamReader:
         """
         return {
             name: {
-                part: len(self._rows(f"{STREAM_GROUP}/{name}/{part}"))
-                for part in STREAMS.get(kind, {})
+                part: len(self._rows(f"{STREAM_GROUP}/{name}/{part}")) for part in self.parts(name)
             }
-            for name, kind in self._file.streams().items()
+            for name in self.streams()
         }

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -30,16 +31,24 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.storage.streams import (
+    EVENTS,
+    EXPOSURES,
+    FRAMES,
     I64,
+    POSES,
+    PULSES,
+    READS,
+    SCALAR,
+    TRIGGERS,
+    WRENCH,
+    Chunk,
+    Column,
     EventChunk,
     FrameChunk,
-    ScalarChunk,
-    StreamChunk,
+    StreamKind,
 )
 
 Array = npt.NDArray[Any]
-Kind = tuple[str, tuple[int, ...], str]
-"""Type, shape of a row, unit."""
 
 FORMAT, INDEX_CUT_FORMAT = 2, 3
 """Formats of new files; the second one where the index ends before the events do."""
@@ -50,60 +59,57 @@ SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
 """Rows of small columns that are buffered; the overhead of each write exceeds its data."""
 
-COLUMNS: dict[str, Kind] = {
-    "events/x": ("uint16", (), "px"),
-    "events/y": ("uint16", (), "px"),
-    "events/p": ("uint8", (), "1 brighter, 0 darker"),
-    "events/t": ("uint32", (), "us of the event camera's clock after t_offset"),
-    "event_pulses/t": ("int64", (), "ns of the event camera's clock"),
-    "arm_pulses/t": ("int64", (), "ns of the arm controller's clock"),
-    "sync_pulses/t": ("int64", (), "ns of the sync box's clock: the trial's time line"),
-    "poses/t": ("int64", (), "ns of the arm controller's clock"),
-    "poses/host": ("int64", (), "ns of the host's monotonic clock"),
-    "poses/xyz": ("float64", (3,), "mm in the arm's base frame"),
-    "poses/rotvec": ("float64", (3,), "degrees, rotation vector"),
-    "frames/number": ("int64", (), "the camera's frame counter"),
-    "frames/t": ("int64", (), "ns of the frame camera's clock, middle of exposure"),
-    "frames/host": ("int64", (), "ns of the host's monotonic clock"),
-    "frames/sync": ("uint8", (), "level of the sync line during exposure"),
+GROUPS: dict[str, tuple[str, StreamKind]] = {
+    "events": ("events", EVENTS),
+    "event_pulses": ("events", PULSES.timed_by("ns of the event camera's clock")),
+    "arm_pulses": ("arm", PULSES.timed_by("ns of the arm controller's clock")),
+    "sync_pulses": (
+        "sync_box",
+        PULSES.timed_by("ns of the sync box's clock: the trial's time line"),
+    ),
+    "poses": ("arm", POSES),
+    "frames": ("frames", FRAMES),
 }
-# only there once something came, a row a frame; -1 represents the number of markers
-TRACKS: dict[str, Kind] = {
-    "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
-    "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
+"""Streams of the rig's own devices: the device and the kind, by the group that holds them."""
+LATE_GROUPS: dict[str, tuple[str, StreamKind]] = {
+    "exposures": (
+        "sync_box",
+        EXPOSURES.timed_by("ns of the sync box's clock, start of an exposure"),
+    ),
+    "box_reads": ("sync_box", READS.timed_by("ns of the sync box's clock")),
+    "frame_camera_reads": ("frames", READS.timed_by("ns of the frame camera's clock")),
+    "triggers": ("events", TRIGGERS),
 }
-# only there once something came, for they depend on which wires a rig has
-TIMING: dict[str, Kind] = {
-    "exposures/t": ("int64", (), "ns of the sync box's clock, start of an exposure"),
-    "box_reads/t": ("int64", (), "ns of the sync box's clock"),
-    "box_reads/before": ("int64", (), "ns of the host's monotonic clock"),
-    "box_reads/after": ("int64", (), "ns of the host's monotonic clock"),
-    "frame_camera_reads/t": ("int64", (), "ns of the frame camera's clock"),
-    "frame_camera_reads/before": ("int64", (), "ns of the host's monotonic clock"),
-    "frame_camera_reads/after": ("int64", (), "ns of the host's monotonic clock"),
-    "triggers/t": ("int64", (), "ns of the event camera's clock"),
-    "triggers/kind": ("uint8", (), "what the event camera noted, as AEDAT4 numbers it"),
+"""Those that are only there once something came, for they depend on which wires a rig has."""
+OWN_DEVICES = {device for device, _ in GROUPS.values()}
+TIMES = "events/t"
+COLUMNS, TIMING = (
+    {
+        f"{group}/{part}": column
+        for group, (_, kind) in groups.items()
+        for part, column in kind.columns.items()
+    }
+    for groups in (GROUPS, LATE_GROUPS)
+)
+WIDE = COLUMNS[TIMES]
+"""The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
+COLUMNS[TIMES] = WIDE._replace(dtype="uint32")
+# only there once something came, a row a frame
+TRACKS: dict[str, Column] = {
+    "tracks/markers": Column(
+        "markers_px", "float32", (-1, 2), "px, column and row; NaN where a marker was not seen"
+    ),
+    "tracks/plate": Column(
+        "plate_px", "float32", (2,), "px, column and row; NaN where the marker was not seen"
+    ),
 }
-STREAMS: dict[str, dict[str, tuple[str, Kind]]] = {
-    "wrench": {
-        "t": ("t_ns", ("int64", (), "ns of the sensor's clock")),
-        "host": ("host_ns", ("int64", (), "ns of the host's monotonic clock")),
-        "force": ("force_n", ("float64", (3,), "N along the sensor's axes")),
-        "torque": ("torque_nm", ("float64", (3,), "N m about the sensor's axes")),
-    },
-    "scalar": {
-        "t": ("t_ns", ("int64", (), "ns of the sensor's clock")),
-        "host": ("host_ns", ("int64", (), "ns of the host's monotonic clock")),
-        "value": ("value", ("float64", (), "the group's attribute `unit`")),
-    },
-}
-"""By kind of a named stream: its columns, each with the field of its chunks. A stream is the group
-``streams/NAME`` with its kind as an attribute, only there once something came."""
+STREAMS = {kind.name: kind for kind in (WRENCH, SCALAR)}
+"""Kinds of SlipLab's own named streams, by name. A named stream is the group ``streams/NAME`` with
+its kind as an attribute, only there once something came. Kinds of other packages are read by what
+the group says."""
 STREAM_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 STREAM_GROUP, KIND_ATTRIBUTE, UNIT_ATTRIBUTE = "streams", "kind", "unit"
-TIMES = "events/t"
-WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
-"""The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
+_GROUP_OF = {(device, kind.name): group for group, (device, kind) in (GROUPS | LATE_GROUPS).items()}
 INDEX, OFFSET = "ms_to_idx", "t_offset"
 _LAST_32 = 2**32 - 1
 INDEXED_MS = 2**32 // 1000 + 1
@@ -121,26 +127,26 @@ def blank() -> bytes:
     made = BytesIO()
     with h5py.File(made, "w", libver="latest") as file:
         file.attrs["format"] = FORMAT
-        for name, kind in COLUMNS.items():
-            create(file, name, kind)
-        create(file, INDEX, ("int64", (), "index of the first event at or after this ms"))
+        for name, column in COLUMNS.items():
+            create(file, name, column)
+        marks = Column("", "int64", (), "index of the first event at or after this ms")
+        create(file, INDEX, marks)
         file[OFFSET] = np.int64(0)
         file[OFFSET].attrs["unit"] = "us of the event camera's clock"
     return made.getvalue()
 
 
-def create(file: Any, name: str, kind: Kind) -> None:
+def create(file: Any, name: str, column: Column) -> None:
     """Make a dataset without rows in an open `h5py.File`."""
-    dtype, shape, unit = kind
     data = file.create_dataset(
         name,
-        (0, *shape),
-        dtype,
-        maxshape=(None, *shape),
-        chunks=(_chunk(name), *shape),
+        (0, *column.shape),
+        column.dtype,
+        maxshape=(None, *column.shape),
+        chunks=(_chunk(name), *column.shape),
         **_filter(name),
     )
-    data.attrs["unit"] = unit
+    data.attrs["unit"] = column.unit
 
 
 def _filter(name: str) -> Any:
@@ -153,7 +159,7 @@ def _chunk(name: str) -> int:
     return EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
 
 
-class Column:
+class _Rows:
     """A dataset that grows at its end.
 
     Rows are gathered until they fill whole chunks: a partial one would be compressed twice.
@@ -197,12 +203,12 @@ class Column:
         self._data.write(h5py.h5s.create_simple(rows.shape), place, rows)
         self._written, self._waiting = end, 0
 
-    def widened(self, file: Any, name: str, kind: Kind) -> Column:
+    def widened(self, file: Any, name: str, kind: Column) -> _Rows:
         """Return the same rows as another type, in place of the dataset `name`."""
         self.flush()
         wider = f"{name}64"
         create(file, wider, kind)
-        column = Column(file, wider)
+        column = _Rows(file, wider)
         old = file[name]
         for start in range(0, self._written, EVENT_CHUNK):
             column.append(old[start : start + EVENT_CHUNK])
@@ -223,25 +229,56 @@ class StreamFile:
         self._last_us: int | None = None
         self._next_ms = 0
         self._wide = False
-        self._kinds: dict[str, str] = {}
-        self._columns = {name: Column(self._file, name) for name in (*COLUMNS, INDEX)}
+        self._kinds: dict[str, StreamKind] = {}
+        self._columns = {name: _Rows(self._file, name) for name in (*COLUMNS, INDEX)}
 
     @property
     def counts(self) -> dict[str, int]:
         """Rows so far, by column."""
         return {name: column.count for name, column in self._columns.items() if name != INDEX}
 
-    def _append(self, name: str, values: Array) -> None:
-        self._columns[name].append(values)
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Append rows to the stream of a device, which is made when its first row comes.
 
-    def add_events(self, chunk: EventChunk) -> None:
-        """Append events.
+        Events come in time order. Of frames only their numbers and times are written.
+
+        Raises:
+            ValueError: the name is not a small identifier, the stream is of another kind, or times
+                of events decrease.
+        """
+        path = _GROUP_OF.get((device, chunk.KIND.name))
+        kind = chunk.KIND
+        if path is None:
+            path = f"{STREAM_GROUP}/{device}"
+            if not STREAM_NAME.fullmatch(device):
+                raise ValueError(f"stream '{device}': a name must match {STREAM_NAME.pattern}")
+            if (known := self._kinds.setdefault(device, kind).name) != kind.name:
+                raise ValueError(f"stream '{device}': is of kind '{known}', not '{kind.name}'")
+        if not len(chunk):
+            return
+        if isinstance(chunk, EventChunk):
+            chunk = self._indexed(chunk)
+        if f"{path}/t" not in self._columns:
+            self._make(path, chunk)
+        for part, column in kind.columns.items():
+            self._columns[f"{path}/{part}"].append(getattr(chunk, column.field))
+
+    def _make(self, path: str, chunk: Chunk) -> None:
+        """Make the columns of a stream."""
+        for part, column in chunk.KIND.columns.items():
+            self._create(f"{path}/{part}", TIMING.get(f"{path}/{part}", column))
+        if path.startswith(STREAM_GROUP):
+            about = self._file[path].attrs
+            about[KIND_ATTRIBUTE] = np.bytes_(chunk.KIND.name)
+            if unit := getattr(chunk, "unit", ""):
+                about[UNIT_ATTRIBUTE] = np.bytes_(unit.encode())
+
+    def _indexed(self, chunk: EventChunk) -> EventChunk:
+        """Return events with times after the offset, once they are in the index.
 
         Raises:
             ValueError: times decrease, inside the chunk or against the one before.
         """
-        if not len(chunk):
-            return
         first, last = int(chunk.t_us[0]), int(chunk.t_us[-1])
         backwards = bool(np.any(chunk.t_us[1:] < chunk.t_us[:-1]))
         if backwards or (self._last_us is not None and first < self._last_us):
@@ -251,13 +288,10 @@ class StreamFile:
         self._last_us = last
         times = chunk.t_us - self._offset
         self._mark(times, int(times[-1]) // 1000 + 1)
-        self._append("events/x", chunk.x)
-        self._append("events/y", chunk.y)
-        self._append("events/p", chunk.p)
         if int(times[-1]) > _LAST_32 and not self._wide:
             self._columns[TIMES] = self._columns[TIMES].widened(self._file, TIMES, WIDE)
             self._wide = True
-        self._append(TIMES, times)
+        return replace(chunk, t_us=times)
 
     def _mark(self, times: I64, end_ms: int) -> None:
         """Note the first event at or after each millisecond before `end_ms`.
@@ -268,45 +302,8 @@ class StreamFile:
         for low in range(self._next_ms, min(end_ms, INDEXED_MS), SMALL_HELD):
             high = min(low + SMALL_HELD, end_ms, INDEXED_MS)
             marks = np.arange(low, high, dtype=np.int64) * 1000
-            self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
+            self._columns[INDEX].append(before + np.searchsorted(times, marks, side="left"))
         self._next_ms = max(end_ms, self._next_ms)
-
-    def append(self, group: str, **columns: Array) -> None:
-        """Append rows to columns of a group, such as ``append("poses", t=..., xyz=...)``.
-
-        Columns of `TIMING` are made when their first row comes.
-        """
-        for part, values in columns.items():
-            name = f"{group}/{part}"
-            if not len(values):
-                continue
-            if name not in self._columns:
-                self._create(name, TIMING[name])
-            self._columns[name].append(values)
-
-    def add_stream(self, name: str, chunk: StreamChunk) -> None:
-        """Append rows to a named stream, which is made when its first row comes.
-
-        Raises:
-            ValueError: the name is not a small identifier, or the stream is of another kind.
-        """
-        if not STREAM_NAME.fullmatch(name):
-            raise ValueError(f"stream '{name}': a name must match {STREAM_NAME.pattern}")
-        kind, columns = chunk.KIND, STREAMS[chunk.KIND]
-        known = self._kinds.setdefault(name, kind)
-        if known != kind:
-            raise ValueError(f"stream '{name}': is of kind '{known}', not '{kind}'")
-        if not len(chunk):
-            return
-        group = f"{STREAM_GROUP}/{name}"
-        if f"{group}/t" not in self._columns:
-            for part, (_, column) in columns.items():
-                self._create(f"{group}/{part}", column)
-            self._file[group].attrs[KIND_ATTRIBUTE] = np.bytes_(kind)
-            if isinstance(chunk, ScalarChunk) and chunk.unit:
-                self._file[group].attrs[UNIT_ATTRIBUTE] = np.bytes_(chunk.unit.encode())
-        for part, (field, _) in columns.items():
-            self._columns[f"{group}/{part}"].append(getattr(chunk, field))
 
     def add_tracks(self, chunk: FrameChunk) -> None:
         """Append the marker positions that a camera returns instead of its frames.
@@ -321,8 +318,7 @@ class StreamFile:
             if values is None and name not in self._columns:
                 continue
             if values is not None and name not in self._columns:
-                dtype, _, unit = TRACKS[name]
-                self._create(name, (dtype, values.shape[1:], unit))
+                self._create(name, TRACKS[name]._replace(shape=values.shape[1:]))
             column = self._columns[name]
             missing = (before if values is not None else after) - column.count
             if missing:
@@ -330,9 +326,9 @@ class StreamFile:
             if values is not None:
                 column.append(values)
 
-    def _create(self, name: str, kind: Kind) -> None:
-        create(self._file, name, kind)
-        self._columns[name] = Column(self._file, name)
+    def _create(self, name: str, column: Column) -> None:
+        create(self._file, name, column)
+        self._columns[name] = _Rows(self._file, name)
 
     def finish(self) -> None:
         """Write buffered rows and the index, and close the file in any case."""
@@ -340,7 +336,7 @@ class StreamFile:
             if self._next_ms > INDEXED_MS:
                 self._file.attrs["format"] = INDEX_CUT_FORMAT
             else:  # one more mark, so that the last millisecond has an end
-                self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
+                self._columns[INDEX].append(np.full(1, self._columns[TIMES].count, np.int64))
             for column in self._columns.values():
                 column.flush()
             self._file[OFFSET][()] = self._offset or 0

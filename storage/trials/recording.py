@@ -330,7 +330,7 @@ class Recording:
         Raises:
             StoreError: the trial has no such stream; the message lists those that it has.
         """
-        self._check_stream(name, ScalarChunk.KIND)
+        self._check_stream(name, ScalarChunk.KIND.name)
         with self.open() as reader:
             return reader.scalars(name)
 
@@ -341,7 +341,7 @@ class Recording:
             StoreError: the trial has no such stream; the message lists those that it has.
         """
         streams = self.record.streams
-        known = [key for key, stream in streams.items() if stream.kind == WrenchChunk.KIND]
+        known = [key for key, stream in streams.items() if stream.kind == WrenchChunk.KIND.name]
         if name not in known:
             raise StoreError(
                 f"{self.folder}: the trial has no wrenches '{name}'; it has: "

@@ -9,6 +9,7 @@
     STORE/campaigns/NAME/registrations/  what was registered before the first trial, one file a time
     STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
     STORE/control/                       requests of people (`storage.trials.control`)
+    STORE/log/                           notes of people (`flows.log`)
     STORE/review/                        decisions about labels (`storage.trials.review`)
     STORE/derived/ models/ report/       results of analysis; may be deleted at any time
     STORE/before/                        copies of what a migration changed
@@ -27,7 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NotRequired, TypedDict, cast
 
-from sliplab.storage.errors import NoStore, StoreError, masked, translated_disk_errors
+from sliplab.storage.errors import NoStore, NoTrial, StoreError, masked, translated_disk_errors
 from sliplab.storage.files import (
     inside,
     json_text,
@@ -68,7 +69,7 @@ ADAPTER = "adapter"
 AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
 counted."""
-_FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
+_FOLDERS = ("campaigns", "control", "log", "derived", "models", "report", "before")
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
@@ -474,6 +475,30 @@ class Store:
             for path in sorted(folder.iterdir())
             if not path.is_symlink() and (path / INFO).is_file()
         ]
+
+    def holders(self, trial: str, campaign: str | None = None) -> list[Campaign]:
+        """Return the campaigns, or that of the name, that have a committed trial of this id."""
+        named = (item for item in self.campaigns() if campaign in (None, item.name))
+        return [item for item in named if trial in item.committed()]
+
+    def holder(self, trial: str, campaign: str | None = None) -> Campaign:
+        """Return the campaign of a committed trial.
+
+        Args:
+            campaign: its name; needed where several have a trial of this id.
+
+        Raises:
+            NoTrial: there is no such trial, or more than one.
+        """
+        found = self.holders(trial, campaign)
+        if len(found) > 1:
+            names = ", ".join(item.name for item in found)
+            raise NoTrial(trial, f"is in {names}; name one with --campaign")
+        if not found:
+            where = str(self.folder) if campaign is None else f"campaign '{campaign}'"
+            listed = f"`sliplab trials {self.folder}` lists them"
+            raise NoTrial(trial, f"is no committed trial of {where}; {listed}")
+        return found[0]
 
     @property
     def simulated(self) -> bool:

@@ -9,25 +9,13 @@ from __future__ import annotations
 import os
 import shutil
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from sliplab.storage.errors import masked
 from sliplab.storage.files import protect, sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.streams import (
-    EVENTS_KIND,
-    FRAMES_KIND,
-    I64,
-    U8,
-    CameraChunk,
-    ClockReads,
-    EventChunk,
-    FrameChunk,
-    Json,
-    PoseChunk,
-    PulseChunk,
-    StreamChunk,
-)
+from sliplab.storage.streams import Chunk, FrameChunk, Json
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,
@@ -41,7 +29,7 @@ from sliplab.storage.trials.checksums import (
     stream_file,
 )
 from sliplab.storage.trials.frame_writer import FrameWriter
-from sliplab.storage.trials.hdf5_writer import STREAM_NAME, StreamFile
+from sliplab.storage.trials.hdf5_writer import OWN_DEVICES, STREAM_NAME, StreamFile
 
 
 def data_files(folder: Path) -> list[str]:
@@ -94,80 +82,45 @@ class TrialWriter:
     ) -> None:
         self.folder, self.target = folder, target
         folder.mkdir(parents=True)
-        self._streams = StreamFile(folder / DATA)
         self._rate_hz, self._spool = rate_hz, spool
-        self._frames: FrameWriter | None = None
-        if frame_px is not None:
-            raw = folder / SPOOL if spool else None
-            self._frames = FrameWriter(self._streams, folder / FRAMES, raw, rate_hz, frame_px)
-        self._further: dict[str, CameraWriter] = {}
+        streams = StreamFile(folder / DATA)
+        raw = folder / SPOOL if spool else None
+        frames = FrameWriter(streams, folder / FRAMES, raw, rate_hz, frame_px)
+        self._files = _Files(streams, None if frame_px is None else frames)
+        self._further: dict[str, tuple[str, _Files]] = {}
         self._sealed = False
 
     @property
     def counts(self) -> dict[str, int]:
         """Rows written so far, by column."""
-        return dict(self._streams.counts)
+        return dict(self._files.streams.counts)
 
-    def add_events(self, chunk: EventChunk) -> None:
-        """Append events."""
-        self._streams.add_events(chunk)
-
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        """Append pulses seen by the event camera."""
-        self._streams.append("event_pulses", t=chunk.t_ns)
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        """Append pulses seen by the arm."""
-        self._streams.append("arm_pulses", t=chunk.t_ns)
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        """Append pulses sent by the sync box."""
-        self._streams.append("sync_pulses", t=chunk.t_ns)
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Append starts of exposures seen by the sync box."""
-        self._streams.append("exposures", t=chunk.t_ns)
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        """Append reads of the sync box's clock."""
-        self._add_reads("box_reads", chunk)
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        """Append reads of the frame camera's clock."""
-        self._add_reads("frame_camera_reads", chunk)
-
-    def _add_reads(self, group: str, chunk: ClockReads) -> None:
-        self._streams.append(group, t=chunk.device_ns, before=chunk.before_ns, after=chunk.after_ns)
-
-    def add_triggers(self, t_ns: I64, kind: U8) -> None:
-        """Append triggers of the event camera, of an imported trial."""
-        self._streams.append("triggers", t=t_ns, kind=kind)
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Append arm poses."""
-        self._streams.append(
-            "poses", t=chunk.t_ns, host=chunk.host_ns, xyz=chunk.xyz_mm, rotvec=chunk.rotvec_deg
-        )
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Append frames, or the tracks in place of them, and their times."""
-        if self._frames is not None:
-            self._frames.add(chunk)
-
-    def add_stream(self, name: str, chunk: StreamChunk | CameraChunk) -> None:
-        """Append to a named stream; that of a further camera has its own files.
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Append a chunk; a further camera has its own files, made with its first chunk.
 
         Raises:
-            ValueError: the name is not a small identifier, or the stream is of another kind.
+            ValueError: the name is not a small identifier, the stream is of another kind, or events
+                come out of order.
         """
-        if isinstance(chunk, StreamChunk):
-            self._streams.add_stream(name, chunk)
+        camera = chunk.KIND.camera
+        if not camera or device in OWN_DEVICES:
+            self._files.add(device, chunk)
             return
-        if name not in self._further:
-            if not STREAM_NAME.fullmatch(name):
-                raise ValueError(f"stream '{name}': a name must match {STREAM_NAME.pattern}")
-            self._further[name] = CameraWriter(self.folder, name, self._rate_hz, self._spool)
-        self._further[name].add(chunk)
+        if device not in self._further:
+            if not STREAM_NAME.fullmatch(device):
+                raise ValueError(f"stream '{device}': a name must match {STREAM_NAME.pattern}")
+            self._further[device] = camera, self._camera_files(device)
+        known, files = self._further[device]
+        if known != camera:
+            raise ValueError(f"stream '{device}': is of kind '{known}', not '{camera}'")
+        files.add(camera, chunk)
+
+    def _camera_files(self, name: str) -> _Files:
+        """Make the files of a further camera."""
+        data, video, raw = (self.folder / stream_file(name, end) for end in ("h5", "mkv", "raw"))
+        streams = StreamFile(data)
+        spool = raw if self._spool else None
+        return _Files(streams, FrameWriter(streams, video, spool, self._rate_hz))
 
     def seal(self) -> Path:
         """Finish data and video files, so that they can be read before the commit.
@@ -178,11 +131,9 @@ class TrialWriter:
         if self._sealed:
             return self.folder
         self._sealed = True
-        self._streams.finish()
-        if self._frames is not None:
-            self._frames.seal()
-        for camera in self._further.values():
-            camera.seal()
+        self._files.seal()
+        for _, files in self._further.values():
+            files.seal()
         return self.folder
 
     def commit(self, record: TrialRecord, provenance: Provenance) -> Path:
@@ -227,13 +178,11 @@ class TrialWriter:
         if not self._sealed:
             self._sealed = True
             try:
-                self._streams.abandon()
-                if self._frames is not None:
-                    self._frames.abandon()
+                self._files.abandon()
             finally:
-                for camera in self._further.values():
+                for _, files in self._further.values():
                     with suppress(OSError, RuntimeError):
-                        camera.abandon()
+                        files.abandon()
 
     def discard(self) -> None:
         """Close open files and delete the folder; for motions that are no trial."""
@@ -241,58 +190,34 @@ class TrialWriter:
         shutil.rmtree(self.folder)
 
 
-class CameraWriter:
-    """Writes the files of one further camera: an HDF5 file as the trial's own, and a video.
+@dataclass
+class _Files:
+    """An HDF5 file, and the video of the frames whose rows it has.
 
-    Args:
-        folder: the trial's folder while it is written.
-        name: the stream's name.
-        spool: as that of `TrialWriter`.
+    Attributes:
+        frames: None drops frames.
     """
 
-    def __init__(self, folder: Path, name: str, rate_hz: int, spool: bool) -> None:
-        self._folder, self._name, self._rate_hz, self._spool = folder, name, rate_hz, spool
-        self._streams = StreamFile(folder / stream_file(name))
-        self._frames: FrameWriter | None = None
-        self._kind: str | None = None
+    streams: StreamFile
+    frames: FrameWriter | None
 
-    def add(self, chunk: CameraChunk) -> None:
-        """Append what the camera sent. Raises ValueError for another kind than it began with."""
-        if isinstance(chunk, ClockReads):
-            self._streams.append(
-                "frame_camera_reads",
-                t=chunk.device_ns,
-                before=chunk.before_ns,
-                after=chunk.after_ns,
-            )
-            return
-        kind = FRAMES_KIND if isinstance(chunk, FrameChunk) else EVENTS_KIND
-        self._kind = self._kind or kind
-        if self._kind != kind:
-            raise ValueError(f"stream '{self._name}': is of kind '{self._kind}', not '{kind}'")
-        if isinstance(chunk, EventChunk):
-            self._streams.add_events(chunk)
-        elif isinstance(chunk, PulseChunk):
-            self._streams.append("event_pulses", t=chunk.t_ns)
-        else:
-            if self._frames is None:
-                video, raw = (
-                    self._folder / stream_file(self._name, suffix) for suffix in ("mkv", "raw")
-                )
-                raw_file = raw if self._spool else None
-                self._frames = FrameWriter(self._streams, video, raw_file, self._rate_hz)
-            self._frames.add(chunk)
+    def add(self, device: str, chunk: Chunk) -> None:
+        """Append a chunk. Raises ValueError as `StreamFile.add`."""
+        if not isinstance(chunk, FrameChunk):
+            self.streams.add(device, chunk)
+        elif self.frames is not None:
+            self.frames.add(chunk)
 
     def seal(self) -> None:
-        """Finish its files."""
-        self._streams.finish()
-        if self._frames is not None:
-            self._frames.seal()
+        """Finish the files."""
+        self.streams.finish()
+        if self.frames is not None:
+            self.frames.seal()
 
     def abandon(self) -> None:
-        """Close its files, as far as the disk takes them."""
+        """Close the files, as far as the disk takes them."""
         try:
-            self._streams.abandon()
+            self.streams.abandon()
         finally:
-            if self._frames is not None:
-                self._frames.abandon()
+            if self.frames is not None:
+                self.frames.abandon()

@@ -68,7 +68,7 @@ def commit_foreign(
     clock = schema.DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     span = origin.get("span_ns", (0, 1_000_000_000))
     writer = campaign.begin(trial, None, 100)
-    writer.add_events(events)
+    writer.add("events", events)
     imported = {key: value for key, value in origin.items() if key != "condition"}
     data = (
         {"format": 1, "trial": trial, "campaign": campaign.name, "experiment": experiment}

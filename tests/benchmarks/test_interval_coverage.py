@@ -6,7 +6,8 @@ import pytest
 
 from benchmarks.interval_coverage import CLUSTERS, IntervalCoverage, alarm_rates, medians_by_world
 
-DRAWS = 1000
+DRAWS = [100, pytest.param(1000, marks=pytest.mark.long)]
+"""Data sets of each case: few, which finds what is far off, and as many as the tables have."""
 
 
 def holds(row: IntervalCoverage) -> bool:
@@ -15,9 +16,9 @@ def holds(row: IntervalCoverage) -> bool:
     return low <= 0.97 and high >= 0.93
 
 
-@pytest.fixture(scope="module")
-def rates() -> list[IntervalCoverage]:
-    return list(alarm_rates(DRAWS, sizes=(8, 24, 156)))
+@pytest.fixture(scope="module", params=DRAWS)
+def rates(request: pytest.FixtureRequest) -> list[IntervalCoverage]:
+    return list(alarm_rates(request.param, sizes=(8, 24, 156)))
 
 
 def test_rate_of_24_clusters_or_more_is_held_in_95_percent(rates: list[IntervalCoverage]) -> None:
@@ -26,6 +27,7 @@ def test_rate_of_24_clusters_or_more_is_held_in_95_percent(rates: list[IntervalC
     assert [row for row in rows if not holds(row)] == []
 
 
+@pytest.mark.parametrize("rates", DRAWS[1:], indirect=True)
 def test_rate_of_few_clusters_is_held_as_often_as_documented(rates: list[IntervalCoverage]) -> None:
     for row in (row for row in rates if row.clusters < 24):
         if "15 %" in row.case and row.clusters == 8:
@@ -36,5 +38,6 @@ def test_rate_of_few_clusters_is_held_as_often_as_documented(rates: list[Interva
             assert row.share > 0.915, row
 
 
-def test_median_over_worlds_is_held_in_95_percent() -> None:
-    assert [row for row in medians_by_world(DRAWS, sizes=(6, 16)) if not holds(row)] == []
+@pytest.mark.parametrize("draws", DRAWS)
+def test_median_over_worlds_is_held_in_95_percent(draws: int) -> None:
+    assert [row for row in medians_by_world(draws, sizes=(6, 16)) if not holds(row)] == []

@@ -24,9 +24,8 @@ from benchmarks.twin_studies import (
     medians_ms,
     within,
 )
-from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file

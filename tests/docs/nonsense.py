@@ -15,6 +15,9 @@ from sliplab.flows.planning.schema import DOCUMENTS, file_schema
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import DocumentError
 
+SOME = 100
+"""Values of a document that take turns: each makes the whole of it be checked."""
+
 
 @cache
 def checker(kind: str) -> Draft7Validator:
@@ -26,7 +29,7 @@ def check_refusals(kind: str, path: Path, *, every: bool = False) -> int:
     """Make every value nonsense, one at a time: the reader refuses what the schema does.
 
     Args:
-        every: each value by all of `JUNK`; by default by one of them, which takes turns.
+        every: each value by all of `JUNK`; by default some `SOME` of them by one that takes turns.
 
     Returns:
         how many were refused.
@@ -36,7 +39,8 @@ def check_refusals(kind: str, path: Path, *, every: bool = False) -> int:
     assert DOCUMENTS[kind][0].parse(data, path).to_json() == data
     # of a list the first entry stands for all
     places = [at for at in leaves(data) if not any(isinstance(key, int) and key for key in at)]
-    for at, junks in nonsense(places, every):
+    step = 1 if every else max(1, len(places) // SOME)
+    for at, junks in nonsense(places[::step], every):
         for junk in junks:
             wrong = changed_at(data, at, junk)
             if checker(kind).is_valid(wrong):

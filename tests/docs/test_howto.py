@@ -20,9 +20,15 @@ from tests.flows.older import older_store
 NOTEBOOK = ROOT / "docs" / "howto" / "from-a-notebook.md"
 READ_WITHOUT = ROOT / "docs" / "howto" / "read-without-sliplab.md"
 GUIDES = sorted(set((ROOT / "docs" / "howto").glob("[a-z]*-*.md")) - {NOTEBOOK})
+WHOLE = ("write-a-driver", "add-an-analysis-step", "import-labelled-data")
+"""Guides that install a package, or go through all steps."""
 
 
-@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "guide",
+    [pytest.param(g, marks=pytest.mark.programs) if g.stem in WHOLE else g for g in GUIDES],
+    ids=lambda path: path.stem,
+)
 def test_the_guide_works_as_printed(guide: Path, checkout: Path) -> None:
     assert walk(guide, checkout) >= 1
 

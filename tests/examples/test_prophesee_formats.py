@@ -180,7 +180,7 @@ def random_events(rng: np.random.Generator, count: int, first_us: int) -> EventC
 def test_what_is_encoded_is_read_by_another_library(tmp_path: Path) -> None:
     events = random_events(np.random.default_rng(7), 4000, 1_000_000)
     kept = events.t_us < 1 << 24
-    events = EventChunk(*(column[kept] for column in vars(events).values()))
+    events = events[kept]
     data = Evt3Encoder().encode(events, np.empty(0, np.int64))
     (path := tmp_path / "a.raw").write_bytes(Header(3, SIZE, "1").text() + data)
     columns = (getattr(events, name).tolist() for name in ("t_us", "x", "y", "p"))
@@ -200,7 +200,7 @@ def test_what_is_encoded_is_decoded_in_any_parts_and_over_turns_of_the_clock() -
         turns.append(found.trigger_us - edges)
         sent.append(events)
         came.append(found.events)
-    whole, back = EventChunk.joined(sent), EventChunk.joined(came)
+    whole, back = EventChunk.concatenate(sent), EventChunk.joined(came)
     for name in ("x", "y", "p"):
         assert np.array_equal(getattr(whole, name), getattr(back, name))
     # 24 bits of 12 hours are known; the rest counts from the beginning

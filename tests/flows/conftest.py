@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import atexit
 import copy
+import functools
 import math
 import os
 import shutil
+import ssl
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,8 @@ Ran = tuple[list[RunRequest], StudyOutcome]
 """What the fixture `ran` gives: the runs of the small study, and how they ended."""
 
 configure_prefect(Path(_HOME))
+# each of Prefect's clients would read this computer's certificates anew; no server here has one
+ssl.create_default_context = functools.cache(ssl.create_default_context)
 # other tests have the other cores; in a fresh clone the first trial takes that long by its kernels
 parallel_map.START_S = math.inf
 

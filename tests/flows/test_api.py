@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import sliplab
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store as TrialStore
+from tests.command_line import here
 from tests.flows.older import older_store
 
 FIRST = "depth=2.4mm,direction=0deg,speed=1.6mmps,r=1"
@@ -135,7 +138,7 @@ def test_a_step_runs_what_is_missing_only(folder: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_named(store: sliplab.Store, tmp_path: Path) -> None:
-    with pytest.raises(sliplab.StoreError, match="trial nothing: no such trial"):
+    with pytest.raises(sliplab.StoreError, match="nothing: is no committed trial of"):
         store.trial("nothing")
     with pytest.raises(sliplab.StoreError, match="has no video; its camera provided tracks"):
         store.trial(FIRST).frame(0)
@@ -155,3 +158,114 @@ def test_a_plan_as_a_table(store: sliplab.Store) -> None:
     assert list(table["trial"]) == [trial.id for trial in plan]
     assert sorted(table["depth_mm"].unique()) == [2.4, 2.8, 3.4]
     assert table["motion_s"].sum() == pytest.approx(plan.total_seconds)
+
+
+def test_checks_and_exchanges_are_those_of_the_commands(
+    store: sliplab.Store, folder: Path, tmp_path: Path
+) -> None:
+    found = store.verify()
+    assert (found["ok"], found["trials"], found["problems"]) == (True, 4, [])
+    said = here("verify", folder, "--json")
+    assert json.loads(said.stdout) == found == sliplab.verify(folder)
+    with pytest.raises(sliplab.InputError, match="is not a store"):
+        sliplab.verify(tmp_path)
+    done = store.export("labels", tmp_path / "labels.csv", "small")
+    assert done == {"labels": 4, "output": str(tmp_path / "labels.csv")}
+    with pytest.raises(sliplab.InputError, match="PART: is needed"):
+        store.export("dsec", tmp_path / "out")
+    with pytest.raises(sliplab.InputError, match="--colour: does not belong to --as labels; no"):
+        store.export("labels", tmp_path / "labels.csv", "small", colour=1)
+    store.export("dsec", tmp_path / "dsec", FIRST)
+    new = tmp_path / "new"
+    made = sliplab.import_data(tmp_path / "dsec", new, name="copy", simulated=True)
+    assert len(made["imported"]) == 1
+    (copy,) = sliplab.open_store(new)
+    assert len(copy.events()) == len(store.trial(FIRST).events())
+    with pytest.raises(sliplab.InputError, match="--name: is missing"):
+        sliplab.import_data(tmp_path / "dsec", new)
+    with pytest.raises(sliplab.InputError, match="--dry-run: is for an import with --adapter"):
+        sliplab.import_data(tmp_path / "dsec", new, dry_run=True)
+
+
+def test_check_says_whether_a_protocol_can_be_collected(tmp_path: Path) -> None:
+    found = sliplab.check("pilot", rig="rehearsal", store=tmp_path / "new")
+    assert found["passed"] == all(item.passed for item in found["checks"])
+    assert "protocol and limits" in {item.name for item in found["checks"]}
+    assert not (tmp_path / "new").exists()
+
+
+def test_windows_are_items_of_torch_and_of_tonic(store: sliplab.Store) -> None:
+    from torch.utils.data import DataLoader
+
+    windows = store.windows("train")
+    chosen = windows[windows["label"].notna()]
+    pixels, events = store.torch_dataset(), store.tonic_dataset()
+    assert len(pixels) == len(events) == len(chosen)
+    x, y = next(iter(DataLoader(pixels, batch_size=4)))
+    assert x.shape == (4, 30, 1, 20, 20)
+    classes = ["no_slip", "incipient", "gross"]
+    assert [classes[k] for k in y] == chosen["label"].head(4).tolist()
+    assert events.sensor_size == (640, 480, 2)
+    found, label = events[1]
+    assert found.dtype.names == events.ordering == ("x", "y", "t", "p")
+    assert ((found["t"] >= 0) & (found["t"] <= 30_000)).all()
+    assert label == pixels[1][1]
+    whole = store.tonic_dataset(transform=len, target_transform=str)
+    assert whole[1] == (len(found), str(label))
+    # rows in any order, and those without a class
+    mixed = windows.sample(20, random_state=0)
+    again = store.torch_dataset(windows=mixed)
+    one = store.torch_dataset(windows=mixed.iloc[7:8])
+    assert torch.equal(again[7][0], one[0][0])
+    unlabelled = windows[windows["label"].isna()].head(1)
+    assert store.torch_dataset(windows=unlabelled)[0][1] == -1
+    with pytest.raises(sliplab.InputError, match="windows: start_ns: is missing"):
+        store.torch_dataset(windows=windows.drop(columns="start_ns"))
+
+
+def test_a_trial_is_described_for_xarray(store: sliplab.Store) -> None:
+    trial = store.trial(FIRST)
+    found = trial.to_dict()
+    sizes: dict[str, int] = {}
+    for part in (*found["coords"].values(), *found["data_vars"].values()):
+        assert len(part["dims"]) == part["data"].ndim
+        for name, size in zip(part["dims"], part["data"].shape, strict=True):
+            assert sizes.setdefault(name, size) == size
+    assert sizes["events"] == len(trial.events())
+    assert (found["data_vars"]["poses_xyz_mm"]["data"] == trial.poses().xyz_mm).all()
+    assert found["attrs"]["simulated"] is True
+    assert found["attrs"]["gross_ns"] == trial.onsets().gross_ns
+
+
+def test_a_trial_is_a_data_set_of_xarray(store: sliplab.Store) -> None:
+    pytest.importorskip("xarray")
+    data = store.trial(FIRST).to_xarray()
+    assert data.sizes["markers"] == len(data["markers_t_ns"])
+
+
+def test_missing_xarray_names_its_extra(
+    store: sliplab.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sliplab\[xarray\]'"):
+        store.trial(FIRST).to_xarray()
+
+
+def test_a_notebook_shows_tables_and_figures(store: sliplab.Store) -> None:
+    plan, trial, model = (
+        sliplab.plan("pilot"),
+        store.trial(FIRST),
+        sliplab.load_model(store.models()[0]),
+    )
+    assert isinstance(plan, sliplab.Plan)
+    for shown, words in (
+        (plan, ("36 trials", "depth_mm")),
+        (store, ("small", "<td>4</td>")),
+        (trial, ("simulated", "2.4 mm", "gross_ns")),
+        (model, ("no slip", "simulated", "30 ms")),
+    ):
+        html = shown._repr_html_()
+        assert all(word in html for word in words), html
+        svg = shown.plot()._repr_svg_()
+        assert svg.startswith("<svg")
+        assert ("simulated" in svg) == (shown is not plan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,13 @@ from tests.flows.conftest import Ran, summary_json, tiny, tiny_gravity, write
 
 
 @pytest.fixture(scope="module")
-def two_seeds(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
-    """Slides by consecutive windows and falling plates by overlapping ones; two networks."""
+def two_seeds(ran: Ran, tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+    """Slides by consecutive windows and falling plates by overlapping ones; two networks.
+
+    The trials and their labels are those of the small study.
+    """
     folder = tmp_path_factory.mktemp("seeds")
+    shutil.copytree(ran[0][0].store, folder / "store")
     slides, plates = tiny(), tiny_gravity()
     slides["analysis"]["training"] = {"epochs": 2, "seeds": [3, 4]}
     plates["analysis"]["detection"] = {"stride_ms": 10}

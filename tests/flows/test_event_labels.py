@@ -79,7 +79,7 @@ def thinned(share: float, from_s: float, to_s: float) -> Callable[[EventChunk, i
         since_s = (events.t_us - gross_us) * 1e-6
         lost = (since_s > from_s) & (since_s < to_s)
         lost &= np.random.default_rng(1).random(len(events)) < share
-        return EventChunk(events.x[~lost], events.y[~lost], events.p[~lost], events.t_us[~lost])
+        return events[~lost]
 
     return change
 

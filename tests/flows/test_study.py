@@ -335,6 +335,7 @@ def test_a_margin_by_option_is_not_kept(ran: Ran) -> None:
     assert summary_json(store)["detection"]["tiny"]["margin"] == 8.0
 
 
+@pytest.mark.long  # tests/goldens holds the summary of these seeds
 def test_the_same_seed_gives_the_same_summary(
     ran: Ran, tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

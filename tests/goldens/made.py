@@ -11,7 +11,9 @@ from typing import Any
 
 import typer
 
+from sliplab.analysis.report.sources import report_folder
 from sliplab.flows.cli.app import command_line
+from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer, here
 from tests.conftest import ROOT
@@ -27,7 +29,7 @@ QUICK_ANSWERS = (
     ("plan", "disturbance", "--rig", "rehearsal"),
 )
 STORE_ANSWERS = ("trials", "verify", "sync", "label")
-LONG = 10_000
+LONG = 12_000
 _TIMES = (
     (r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?", "TIME"),
     (r"\b[0-9a-f]{64}\b", "HASH"),
@@ -75,6 +77,37 @@ def checksums(folder: Path) -> dict[str, str]:
         for campaign in Store.open(folder / "store").campaigns()
         for each in campaign.recordings()
     }
+
+
+def study_of(store: Path) -> dict[str, Any]:
+    """Return the summary and the text of the report of a studied store, and for which processor.
+
+    Numbers have six digits, which is what rounding in another order leaves.
+    """
+    import torch
+
+    report = report_folder(Store.open(store))
+    summary = read_json(report / "summary.json")
+    for name in ("timing_s", "versions"):
+        summary.pop(name)
+    page = (report / "index.html").read_text()
+    page = re.sub(r"(?s)<style>.*?</style>|<svg.*?</svg>|<[^>]*>", " ", page)
+    page, *_ = page.split("wall time (s)")  # and versions
+    page = re.sub(r"\s*\n\s*", "\n", page).strip()
+    rounded = _six_digits(neutral(summary, store))
+    return {
+        "processor": torch.backends.cpu.get_cpu_capability(),
+        "summary": {name: _short(each) for name, each in rounded.items()},
+        "page": neutral(page, store).splitlines(),
+    }
+
+
+def _six_digits(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {name: _six_digits(each) for name, each in value.items()}
+    return [_six_digits(each) for each in value] if isinstance(value, list) else value
 
 
 def neutral(value: Any, folder: Path) -> Any:

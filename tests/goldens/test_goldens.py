@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.goldens.made import FIXTURES, answers, checksums, help_text
+from tests.flows.conftest import Ran, run_small_study
+from tests.goldens.made import FIXTURES, answers, checksums, help_text, study_of
 
 
 @pytest.fixture(autouse=True)
@@ -37,6 +38,15 @@ def test_bytes_of_simulated_trials(tmp_path: Path) -> None:
     assert checksums(tmp_path) == json.loads((FIXTURES / "checksums.json").read_text())
 
 
+def test_figures_and_report_of_the_small_study(ran: Ran) -> None:
+    expected, found = json.loads((FIXTURES / "study.json").read_text()), study_of(ran[0][0].store)
+    if found["processor"] != expected["processor"]:
+        pytest.skip("another kind of processor trains another network")
+    for name in expected["summary"].keys() | found["summary"].keys():
+        assert found["summary"].get(name) == expected["summary"].get(name), name
+    assert found["page"] == expected["page"]
+
+
 def main() -> None:
     """Write the fixtures."""
     os.environ["COLUMNS"] = "100"
@@ -47,6 +57,10 @@ def main() -> None:
             (Path(folder) / name).mkdir()
             text = json.dumps(found(Path(folder) / name), indent=1)
             (FIXTURES / f"{name}.json").write_text(f"{text}\n")
+        (Path(folder) / "study").mkdir()
+        (run_request, *_), _ = run_small_study(Path(folder) / "study", Path("rehearsal"))
+        text = json.dumps(study_of(run_request.store), indent=1)
+        (FIXTURES / "study.json").write_text(f"{text}\n")
 
 
 if __name__ == "__main__":

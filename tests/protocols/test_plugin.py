@@ -20,25 +20,35 @@ LOADED = """
 import contextlib, io, json, sys
 from sliplab.flows.cli.app import command_line
 
-words = json.loads(sys.argv[1])
-with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(sys.stderr):
-    command_line(words)(words, standalone_mode=False)
-print(json.dumps([name for name in sys.modules if name.startswith("sliplab.plugins")]))
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(sys.stderr):
+        command_line(words)(words, standalone_mode=False)
+    print(json.dumps([name for name in sys.modules if name.startswith("sliplab.plugins")]))
 """
 
 
-def loaded(*words: str) -> list[str]:
-    """Run a command in a new process; return the modules of plug-ins that it loads."""
-    found: list[str] = json.loads(said_by(LOADED, json.dumps(words)).splitlines()[-1])
-    return found
-
-
-def test_a_command_of_the_core_loads_no_plug_in(tmp_path: Path) -> None:
-    assert loaded("plan", "pilot", "--json") == []
+def test_a_command_loads_no_plug_in_that_it_does_not_use(tmp_path: Path) -> None:
+    """One after another in a new process: what one loads stays for the next."""
+    claims = tmp_path / "claims.yaml"
+    stopping = "  stopping: {claims: [{figure: first_slip, at_most: 10 s}]}\n"
+    pilot = (ROOT / "protocols" / "pilot.yaml").read_text()
+    claims.write_text(pilot.replace("collection:\n", f"collection:\n{stopping}", 1))
     options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
-    assert loaded("collect", "pilot", *options) == []
-    assert "sliplab.plugins.bench.study" in loaded("bench", "--help")
-    assert "sliplab.plugins.bench.run" not in loaded("bench", "--help")
+    commands = [
+        ("plan", "pilot", "--json"),
+        ("collect", "pilot", *options),
+        ("plan", str(claims), "--json"),
+        ("collect", str(claims), *options[:3], str(tmp_path / "other"), *options[4:]),
+        ("bench", "--help"),
+    ]
+    said = said_by(LOADED, json.dumps(commands)).splitlines()
+    *core, collected, helped = (json.loads(line) for line in said if line.startswith("["))
+    assert core == [[], [], []]
+    assert "sliplab.plugins.claims.rounds" in collected
+    assert not [name for name in collected if name.startswith("sliplab.plugins.claims.power")]
+    assert not [name for name in collected if name.startswith("sliplab.plugins.bench.")]
+    assert "sliplab.plugins.bench.study" in helped
+    assert "sliplab.plugins.bench.run" not in helped
 
 
 def test_help_of_all_plug_ins_loads_no_arrays() -> None:
@@ -49,19 +59,6 @@ def test_help_of_all_plug_ins_loads_no_arrays() -> None:
         "except SystemExit: print({'numpy', 'h5py', 'pandas', 'torch'} & set(sys.modules))"
     )
     assert said_by(code).splitlines()[-1] == "set()"
-
-
-def test_claims_load_what_they_need_when_trials_are_taken(tmp_path: Path) -> None:
-    claims = tmp_path / "claims.yaml"
-    stopping = "  stopping: {claims: [{figure: first_slip, at_most: 10 s}]}\n"
-    pilot = (ROOT / "protocols" / "pilot.yaml").read_text()
-    claims.write_text(pilot.replace("collection:\n", f"collection:\n{stopping}", 1))
-    assert loaded("plan", str(claims), "--json") == []
-    options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
-    collected = loaded("collect", str(claims), *options)
-    assert "sliplab.plugins.claims.rounds" in collected
-    assert not [name for name in collected if name.startswith("sliplab.plugins.claims.power")]
-    assert not [name for name in collected if name.startswith("sliplab.plugins.bench.")]
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sliplab.protocols import InputError
-from sliplab.rigs.build import _driven_stream
+from sliplab.rigs.build import driven_stream
 from sliplab.rigs.core.capabilities import RigError, ScalarSensor
-from sliplab.rigs.core.further import FurtherForces, FurtherScalars, FurtherStream
+from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.discovery import ping_devices
 from sliplab.rigs.rig_file import RigFile, load_rig_file
@@ -88,11 +88,11 @@ class Arm:
     """An arm that no device here asks anything of."""
 
 
-def built(name: str, stream: Stream) -> FurtherStream:
+def built(name: str, stream: Stream) -> DeviceStream:
     """A further device by its driver, on a plate as an arm's base."""
     frame = PlateFrame.taught(((0.0, 0.0, 0.0), (60.0, 0.0, 0.0), (0.0, 60.0, 0.0)))
     arm: Any = Arm()
-    return _driven_stream(name, stream, None, arm, frame)
+    return driven_stream(name, stream, arm, frame)
 
 
 def real_rig(folder: Path, streams: dict[str, Any], **devices: Any) -> RigFile:
@@ -108,15 +108,14 @@ def test_a_scalar_sensor_of_a_package_is_read(install: Install, tmp_path: Path) 
     install("lab_thermometer", THERMOMETER, "lab_thermometer = lab_thermometer:DRIVER")
     file = real_rig(tmp_path, {"warm": WARM})
     device = built("warm", file.streams["warm"])
-    assert isinstance(device, FurtherScalars)
     assert isinstance(device.device, ScalarSensor)
     assert device.about.unit == "degC"
     assert device.through_host
     got: list[ScalarChunk] = []
 
     class Sink(NullSink):
-        def add_stream(self, name: str, chunk: Any) -> None:
-            assert name == "warm"
+        def add(self, device: str, chunk: Any) -> None:
+            assert device == "warm"
             got.append(chunk)
 
     device.connect()
@@ -201,7 +200,6 @@ def test_a_second_force_sensor_is_one_of_the_drivers_of_the_first(tmp_path: Path
     stream = real_rig(tmp_path, {"wrist": wrist}).streams["wrist"]
     assert (stream.timing.grade, stream.timing.delay.longest_us) == ("host time", 5000)
     made = built("wrist", stream)
-    assert isinstance(made, FurtherForces)
     assert made.about.to_plate is not None
     assert np.allclose(np.abs(np.linalg.det(np.array(made.about.to_plate))), 1.0)
     said = {**wrist, "timing": {"grade": "arm clock"}}

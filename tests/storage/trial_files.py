@@ -50,14 +50,14 @@ def fill(
     edges = np.linspace(0, count, pieces + 1).astype(int)
     for low, high in pairwise(edges):
         rows = slice(low, high)
-        writer.add_events(EventChunk(whole.x[rows], whole.y[rows], whole.p[rows], whole.t_us[rows]))
+        writer.add("events", whole[rows])
     times = np.arange(10, dtype=np.int64)
-    writer.add_event_pulses(PulseChunk(times))
-    writer.add_arm_pulses(PulseChunk(times))
-    writer.add_sync_pulses(PulseChunk(times))
-    writer.add_poses(PoseChunk(times, times, np.ones((10, 3)), np.zeros((10, 3))))
+    writer.add("events", PulseChunk(times))
+    writer.add("arm", PulseChunk(times))
+    writer.add("sync_box", PulseChunk(times))
+    writer.add("arm", PoseChunk(times, times, np.ones((10, 3)), np.zeros((10, 3))))
     if with_frames:
-        writer.add_frames(frames(12))
+        writer.add("frames", frames(12))
 
 
 def record(trial: str, **changes: Any) -> TrialRecord:

@@ -65,7 +65,7 @@ class LabCamera:
             RigError: the camera is gone, silent, set its clock back or was not read in time, and
                 all that came before was read.
         """
-        return EventChunk.joined(self._buffer.take("events"))
+        return EventChunk.concatenate(self._buffer.take("events"))
 
     def read_pulses(self) -> PulseChunk:
         """Return the sync pulses since the last call, camera clock in ns. Raises as `read`."""

@@ -55,7 +55,7 @@ class Prophesee:
         with self._changed:
             parts, self._events, self._held = self._events, [], 0
             self._check(news=bool(parts))
-        return EventChunk.joined(parts)
+        return EventChunk.concatenate(parts)
 
     def read_pulses(self) -> PulseChunk:
         """Return the rising edges of the trigger input since the last call, camera clock in ns.

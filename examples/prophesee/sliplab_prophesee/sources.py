@@ -262,7 +262,7 @@ class CameraSource:
         raw = self._stream.get_latest_raw_data()
         if raw is not None:
             self._decoder.decode(raw)
-        events = EventChunk.joined(self._events)
+        events = EventChunk.concatenate(self._events)
         edges = np.concatenate(self._edges) if self._edges else None
         self._events, self._edges = [], []
         if edges is None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Predictions, Reading, TrialWithSlip, cusum, learn
+from sliplab.analysis.detectors.detectors import Predictions, Rule, TrialWithSlip, learn
 from sliplab.analysis.detectors.latency import TrueSlip
-from sliplab.analysis.detectors.smoothing_rule import lead_of
-from sliplab.analysis.metrics.classification import INCIPIENT, NO_SLIP, winners
+from sliplab.analysis.detectors.smoothing_rule import paper_level, paper_rule
+from sliplab.analysis.metrics.classification import winners
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.network import parameters
 from sliplab.analysis.networks.spiking import SpikeEngine
@@ -47,6 +46,7 @@ class Spiking(WindowDetector):
         super().__init__(settings.windows, stride_ms)
         self.settings, self._by_paper = settings, by_paper
         self._engine: SpikeEngine | None = None
+        self._rule: Rule = paper_rule(settings.detection).detector
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         """See `Detector`."""
@@ -78,11 +78,16 @@ class Spiking(WindowDetector):
     def decide(self, x: SparseWindows) -> tuple[npt.ArrayLike, npt.ArrayLike | None]:
         """See `WindowDetector`."""
         counts = self.counts(x)
-        return self.evidence(counts), winners(counts)
+        return self.read(Predictions(counts, x.totals, np.arange(len(counts)))), winners(counts)
 
-    @abstractmethod
-    def evidence(self, counts: npt.NDArray[np.int64]) -> npt.ArrayLike:
-        """Return evidence (n,) of the next windows by their output spikes (n, 3)."""
+    def restart(self) -> None:
+        """See `WindowDetector`."""
+        self._state = self._rule.begin()
+
+    def read(self, windows: Predictions) -> npt.NDArray[np.float64]:
+        """Return evidence (n,) of the next windows, by the rule."""
+        self._state, found = self._rule.push(self._state, windows)
+        return found.incipient
 
     def cost(self) -> Cost:
         """Return synaptic operations of a window, and the size of float32 weights."""
@@ -103,17 +108,10 @@ class PaperEntry(Spiking):
         settings = _settings(preset="paper")
         super().__init__(settings, settings.stride_ms, by_paper)
 
-    def restart(self) -> None:
-        """See `WindowDetector`."""
-        self._last = np.empty((0, 3), np.int64)
-
-    def evidence(self, counts: npt.NDArray[np.int64]) -> npt.ArrayLike:
+    def read(self, windows: Predictions) -> npt.NDArray[np.float64]:
         """See `Spiking`."""
-        rule = self.settings.detection
-        every = np.concatenate([self._last, counts])
-        self._last = every[-rule.smoothing + 1 :]
-        lead = lead_of(every, rule.smoothing, INCIPIENT)[len(every) - len(counts) :]
-        return np.where((lead > 0) & (lead >= rule.margin), lead, -np.inf)
+        lead = super().read(windows)
+        return np.where(lead > paper_level(self.settings.detection.margin), lead, -np.inf)
 
 
 class Ours(Spiking):
@@ -134,18 +132,7 @@ class Ours(Spiking):
             self.windows.length_ms * 1_000_000,
             self.settings.most_spikes,
         )
-        self._reading: Reading = learned.readings["counts"]
-
-    def restart(self) -> None:
-        """See `WindowDetector`."""
-        self._level = 0.0
-
-    def evidence(self, counts: npt.NDArray[np.int64]) -> npt.ArrayLike:
-        """See `Spiking`."""
-        log = self._share * self._reading.likelihood.log(counts)
-        found = cusum(log[:, INCIPIENT] - log[:, NO_SLIP], self._level)
-        self._level = float(found[-1]) if len(found) else self._level
-        return found
+        self._rule = learned.detectors(self._share)["cusum counts"]
 
     def _labelled(self, scene: Scene) -> TrialWithSlip:
         """Return a scene's consecutive windows with its true slip."""

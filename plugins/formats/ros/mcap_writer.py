@@ -19,7 +19,6 @@ import numpy as np
 
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.files import inside, json_text
-from sliplab.storage.formats.foreign import part_of
 from sliplab.storage.schema.label import KINDS, LABELS, RULES, RuleOnsets, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, Json
 from sliplab.storage.trials.checksums import DATA, PROVENANCE, RECORD, stream_file
@@ -316,7 +315,7 @@ def _packets(recording: Recording, name: str) -> Iterator[EventChunk]:
             edges = np.flatnonzero(np.diff((chunk.t_us - first) // _PACKET_US)) + 1
             whole = np.union1d(edges, np.arange(0, len(chunk), _PACKET_EVENTS)).tolist()
             for low, high in zip(whole, [*whole[1:], len(chunk)], strict=True):
-                yield part_of(chunk, low, high)
+                yield chunk[low:high]
 
 
 def _column_units(reader: StreamReader) -> dict[str, str]:
@@ -324,14 +323,14 @@ def _column_units(reader: StreamReader) -> dict[str, str]:
     known = {**COLUMNS, **TRACKS, **TIMING}
     counts = reader.counts()
     found = {
-        name: unit
-        for name, (_, _, unit) in known.items()
+        name: column.unit
+        for name, column in known.items()
         if counts[name] and not name.startswith("events/")
     }
     for name, kind in reader.streams().items():
         unit = reader.scalars(name).unit if kind == "scalar" else ""
-        for part, (_, (_, _, of_part)) in STREAMS.get(kind, {}).items():
-            found[f"{STREAM_GROUP}/{name}/{part}"] = unit if part == "value" else of_part
+        for part, column in STREAMS[kind].columns.items() if kind in STREAMS else ():
+            found[f"{STREAM_GROUP}/{name}/{part}"] = unit if part == "value" else column.unit
     return found
 
 

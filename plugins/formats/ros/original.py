@@ -8,7 +8,7 @@ then compute again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -23,21 +23,28 @@ from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Provenance, StreamCounts, SyncResult, TrialRecord
 from sliplab.storage.streams import (
+    CHUNKS,
     EVENTS_KIND,
     FRAMES_KIND,
+    SCALAR,
     U8,
-    ClockReads,
+    Chunk,
     EventChunk,
     FrameChunk,
     Json,
-    PoseChunk,
-    PulseChunk,
-    ScalarChunk,
-    WrenchChunk,
 )
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.hdf5_writer import COLUMNS, STREAM_GROUP, STREAMS, TIMING, TRACKS
+from sliplab.storage.trials.hdf5_writer import (
+    COLUMNS,
+    GROUPS,
+    LATE_GROUPS,
+    OWN_DEVICES,
+    STREAM_GROUP,
+    STREAMS,
+    TIMING,
+    TRACKS,
+)
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import content_problems
@@ -45,9 +52,6 @@ from sliplab.storage.trials.writer import TrialWriter
 
 Array = npt.NDArray[Any]
 _FRAMES_AT_ONCE = 32
-_CHUNKS: dict[str, type[WrenchChunk] | type[ScalarChunk]] = {
-    chunk.KIND: chunk for chunk in (WrenchChunk, ScalarChunk)
-}
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,13 @@ class Original:
     def _check_column(self, file: str, name: str, values: Array) -> None:
         streams, known = self.record.streams, {**COLUMNS, **TRACKS, **TIMING}
         for stream, stated in streams.items():
-            for part, (_, kind) in STREAMS.get(stated.kind, {}).items():
-                known[f"{STREAM_GROUP}/{stream}/{part}"] = kind
+            if stated.kind in STREAMS:
+                for part, column in STREAMS[stated.kind].columns.items():
+                    known[f"{STREAM_GROUP}/{stream}/{part}"] = column
         files = {DATA, *(stream_file(name) for name, stated in streams.items() if stated.of_camera)}
         if name not in known or name.startswith("events/") or file not in files:
             raise FormatError(f"holds the column {name!r:.60} of {file!r:.60}, which no trial has")
-        dtype, shape, _ = known[name]
+        _, dtype, shape, _ = known[name]
         fits = len(values.shape) == len(shape) + 1 and all(
             wanted in (-1, found) for wanted, found in zip(shape, values.shape[1:], strict=True)
         )
@@ -137,54 +142,40 @@ class Original:
 
     @interruptible
     def _fill(self, writer: TrialWriter) -> None:
-        data = {name: values for (file, name), values in self.columns.items() if file == DATA}
-        for chunk in self._events(EVENTS_KIND):
-            writer.add_events(chunk)
-        for group, add in (
-            ("event_pulses", writer.add_event_pulses),
-            ("arm_pulses", writer.add_arm_pulses),
-            ("sync_pulses", writer.add_sync_pulses),
-            ("exposures", writer.add_exposures),
-        ):
-            if f"{group}/t" in data:
-                add(PulseChunk(data[f"{group}/t"]))
-        for group, add_reads in (
-            ("box_reads", writer.add_box_reads),
-            ("frame_camera_reads", writer.add_frame_camera_reads),
-        ):
-            if f"{group}/t" in data:
-                add_reads(ClockReads(*_group(data, group, ("t", "before", "after"))))
-        if "triggers/t" in data:
-            writer.add_triggers(*_group(data, "triggers", ("t", "kind")))
-        if "poses/t" in data:
-            writer.add_poses(PoseChunk(*_group(data, "poses", ("t", "host", "xyz", "rotvec"))))
-        for frames in self._frames(FRAMES_KIND, data):
-            writer.add_frames(frames)
+        self._fill_file(writer, DATA, {device: device for device in OWN_DEVICES})
+        data = self._of(DATA)
         for name, stated in self.record.streams.items():
+            group = f"{STREAM_GROUP}/{name}"
             if stated.of_camera:
-                self._fill_camera(writer, name)
-            elif f"{STREAM_GROUP}/{name}/t" in data:
-                parts = STREAMS[stated.kind]
-                values = _group(data, f"{STREAM_GROUP}/{name}", tuple(parts))
-                named: dict[str, Any] = {
-                    field: found for (field, _), found in zip(parts.values(), values, strict=True)
-                }
-                if stated.kind == ScalarChunk.KIND:
-                    named["unit"] = self.units.get(name, "")
-                writer.add_stream(name, _CHUNKS[stated.kind](**named))
+                self._fill_file(writer, stream_file(name), {stated.kind: name})
+            elif f"{group}/t" in data:
+                unit = {"unit": self.units.get(name, "")} if stated.kind == SCALAR.name else {}
+                writer.add(name, _chunk(data, group, stated.kind, **unit))
 
-    def _fill_camera(self, writer: TrialWriter, name: str) -> None:
-        file = stream_file(name)
-        data = {part: values for (of, part), values in self.columns.items() if of == file}
-        for chunk in self._events(name):
-            writer.add_stream(name, chunk)
-        for frames in self._frames(name, data):
-            writer.add_stream(name, frames)
-        if "event_pulses/t" in data:
-            writer.add_stream(name, PulseChunk(data["event_pulses/t"]))
-        if "frame_camera_reads/t" in data:
-            reads = _group(data, "frame_camera_reads", ("t", "before", "after"))
-            writer.add_stream(name, ClockReads(*reads))
+    def _of(self, file: str) -> dict[str, Array]:
+        return {name: values for (of, name), values in self.columns.items() if of == file}
+
+    def _fill_file(self, writer: TrialWriter, file: str, devices: Mapping[str, str]) -> None:
+        """Write what one file has.
+
+        Args:
+            devices: to whose streams it goes, by the device that has such groups in a trial's own
+                file.
+        """
+        data = self._of(file)
+        for group, (device, kind) in (GROUPS | LATE_GROUPS).items():
+            if device not in devices:
+                continue
+            name = devices[device]
+            chunks: Iterable[Chunk] = ()
+            if group == EVENTS_KIND:
+                chunks = self._events(name)
+            elif group == FRAMES_KIND:
+                chunks = self._frames(name, data)
+            elif f"{group}/t" in data:
+                chunks = [_chunk(data, group, kind.name)]
+            for chunk in chunks:
+                writer.add(name, chunk)
 
     def _events(self, name: str) -> Iterator[EventChunk]:
         return self.events[name]() if name in self.events else iter(())
@@ -234,6 +225,14 @@ class Original:
         make_folder(campaign.sync_folder)
         saved = self.sync.model_copy(update={"raw": recording.raw_checksum})
         write_json(campaign.sync_file(recording.folder.name), saved.to_json())
+
+
+def _chunk(data: Mapping[str, Array], group: str, kind: str, **more: str) -> Chunk:
+    """Return the rows of a group. Raises FormatError as `_group`."""
+    chunk = CHUNKS[kind]
+    parts = tuple(chunk.KIND.columns)
+    found = dict(zip(parts, _group(data, group, parts), strict=True))
+    return chunk.from_columns(found, **more)
 
 
 def _group(data: Mapping[str, Array], group: str, parts: tuple[str, ...]) -> list[Array]:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.analysis.study import Finding, Study
-from sliplab.flows.cli.common import CampaignOption, located, opened_campaigns
+from sliplab.flows.cli.common import CampaignOption, opened_campaigns
 from sliplab.flows.cli.steps import ReviewedOption
 from sliplab.flows.running import console
+from sliplab.flows.steps import located
 from sliplab.plugins.studies.detector.document import DetectorTradeoff
 from sliplab.plugins.studies.detector.grid import Axes
 from sliplab.protocols.errors import InputError

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sliplab.rigs.core.driver import ArmDriver, ArmScene
+from sliplab.rigs.core.driver import ArmDriver, ArmScene, lazy
 from sliplab.rigs.core.network import answers, arm_lock
 from sliplab.rigs.devices.abb.settings import AbbSettings
 
 if TYPE_CHECKING:
-    from sliplab.rigs.core.capabilities import Arm
     from sliplab.rigs.core.fakes import FakeController
-
-
-def _build(settings: AbbSettings) -> Arm:
-    from sliplab.rigs.devices.abb.driver import AbbArm
-
-    return AbbArm(settings)
 
 
 def _fake(settings: AbbSettings, scene: ArmScene) -> FakeController:
@@ -42,6 +35,6 @@ DRIVER = ArmDriver(
     ping=lambda settings: answers(settings.host, settings.rws_port),
     address=lambda settings: settings.host,
     locks=arm_lock,
-    build=_build,
+    build=lazy("sliplab.rigs.devices.abb.driver:AbbArm"),
     fake=_fake,
 )

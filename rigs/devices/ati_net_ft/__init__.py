@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sliplab.rigs.core.driver import FakeForceSensor, ForceSensorDriver
+from sliplab.rigs.core.driver import ForceSensorDriver, lazy
 from sliplab.rigs.core.network import answers
 from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 
-if TYPE_CHECKING:
-    from sliplab.rigs.core.capabilities import Arm, ForceSensor
-
-
-def _build(settings: AtiNetFtSettings, arm: Arm) -> ForceSensor:
-    from sliplab.rigs.devices.ati_net_ft.driver import AtiNetFt
-
-    return AtiNetFt(settings)
+_sensor = lazy("sliplab.rigs.devices.ati_net_ft.driver:AtiNetFt")
+_fake = lazy("sliplab.rigs.devices.ati_net_ft.fake:FakeNetFt")
 
 
 def _ping(settings: AtiNetFtSettings) -> str | None:
@@ -27,12 +21,6 @@ def _ping(settings: AtiNetFtSettings) -> str | None:
 def _locks(settings: AtiNetFtSettings) -> dict[str, str]:
     host = settings.host.lower()
     return {f"force-{host}": f"the force sensor at {host}"}
-
-
-def _fake(settings: AtiNetFtSettings) -> FakeForceSensor:
-    from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt
-
-    return FakeNetFt(settings.host, tick_hz=settings.tick_hz, fed=True)
 
 
 def _reach(settings: AtiNetFtSettings, address: Any) -> AtiNetFtSettings:
@@ -47,7 +35,7 @@ DRIVER = ForceSensorDriver(
     ping=_ping,
     address=lambda settings: settings.host,
     locks=_locks,
-    build=_build,
-    fake=_fake,
+    build=lambda settings, arm: _sensor(settings),
+    fake=lambda settings: _fake(settings.host, tick_hz=settings.tick_hz, fed=True),
     reach=_reach,
 )

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sliplab.rigs.core.driver import FrameCameraDriver, SceneFrames
+from sliplab.rigs.core.driver import FrameCameraDriver, SceneFrames, lazy
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 
 if TYPE_CHECKING:
     from sliplab.rigs.core.capabilities import FrameCamera
 
-
-def _build(settings: BaslerSettings, px_per_mm: float) -> FrameCamera:
-    from sliplab.rigs.devices.basler.driver import BaslerCamera
-
-    return BaslerCamera(settings.model_copy(update={"px_per_mm": px_per_mm}))
+_camera = lazy("sliplab.rigs.devices.basler.driver:BaslerCamera")
 
 
 def _ping(settings: BaslerSettings) -> str | None:
@@ -27,18 +23,10 @@ def _ping(settings: BaslerSettings) -> str | None:
 def _fake(
     settings: BaslerSettings, px_per_mm: float, scene: SceneFrames, mid_exposure_ns: int
 ) -> FrameCamera:
-    from sliplab.rigs.devices.basler.driver import BaslerCamera
     from sliplab.rigs.devices.basler.fake_live import LiveBasler
 
     device = LiveBasler(scene, mid_exposure_ns, settings.sync_line or 1)
-    return BaslerCamera(settings.model_copy(update={"px_per_mm": px_per_mm}), device)
-
-
-def _unplug(camera: FrameCamera) -> None:
-    from sliplab.rigs.devices.basler.driver import BaslerCamera
-
-    assert isinstance(camera, BaslerCamera)
-    camera.device.unplug()
+    return _camera(settings.model_copy(update={"px_per_mm": px_per_mm}), device)
 
 
 DRIVER = FrameCameraDriver(
@@ -47,7 +35,7 @@ DRIVER = FrameCameraDriver(
     settings=BaslerSettings,
     libraries=("pypylon",),
     ping=_ping,
-    build=_build,
+    build=lambda settings, px_per_mm: _camera(settings.model_copy(update={"px_per_mm": px_per_mm})),
     fake=_fake,
-    unplug=_unplug,
+    unplug=lambda camera: camera.device.unplug(),
 )

@@ -2,19 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from sliplab.rigs.core.driver import EventCameraDriver, FakeEventCamera
+from sliplab.rigs.core.driver import EventCameraDriver, lazy
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
-
-if TYPE_CHECKING:
-    from sliplab.rigs.core.capabilities import EventCamera
-
-
-def _build(settings: DvxplorerSettings) -> EventCamera:
-    from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
-
-    return DvxplorerCamera(settings)
 
 
 def _ping(settings: DvxplorerSettings) -> str | None:
@@ -29,12 +18,6 @@ def _ping(settings: DvxplorerSettings) -> str | None:
     return None
 
 
-def _fake(size: tuple[int, int]) -> FakeEventCamera:
-    from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
-
-    return LiveDvxplorer(size)
-
-
 def _reach(settings: DvxplorerSettings, address: tuple[int, int]) -> DvxplorerSettings:
     source = NetworkStream(events_port=address[0], triggers_port=address[1])
     return settings.model_copy(update={"source": source})
@@ -46,7 +29,7 @@ DRIVER = EventCameraDriver(
     settings=DvxplorerSettings,
     libraries=("dv_processing",),
     ping=_ping,
-    build=_build,
-    fake=_fake,
+    build=lazy("sliplab.rigs.devices.dvxplorer.driver:DvxplorerCamera"),
+    fake=lazy("sliplab.rigs.devices.dvxplorer.fake_stream:LiveDvxplorer"),
     reach=_reach,
 )

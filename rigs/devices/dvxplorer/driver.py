@@ -171,7 +171,7 @@ class DvxplorerCamera:
             parts, self._events, self._held = self._events, [], 0
             if not parts:
                 self._check()
-        return EventChunk.joined(parts)
+        return EventChunk.concatenate(parts)
 
     def read_pulses(self) -> PulseChunk:
         """Return the pulses since the last call, camera clock in ns. Raises RigError as `read`."""

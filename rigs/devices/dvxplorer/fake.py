@@ -155,9 +155,7 @@ def arrays(chunk: EventChunk, pulses_us: I64, packet_us: int) -> Iterator[Packet
     edges = np.arange(every.min(), every.max() + packet_us + 1, packet_us)
     rows, marks = np.searchsorted(chunk.t_us, edges), np.searchsorted(pulses_us, edges)
     for k in range(len(edges) - 1):
-        part = slice(rows[k], rows[k + 1])
-        events = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-        yield events, pulses_us[marks[k] : marks[k + 1]]
+        yield chunk[rows[k] : rows[k + 1]], pulses_us[marks[k] : marks[k + 1]]
 
 
 def scene(seconds: float, seed: int = 1) -> Iterator[Packet]:

@@ -3,22 +3,9 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
 
-from sliplab.rigs.core.driver import SyncBoxDriver
+from sliplab.rigs.core.driver import SyncBoxDriver, lazy
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from sliplab.rigs.core.capabilities import SyncBox
-    from sliplab.rigs.core.driver import FakeBox, OnTrain
-
-
-def _build(settings: SyncBoxSettings) -> SyncBox:
-    from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-
-    return SerialSyncBox(settings)
 
 
 def _ping(settings: SyncBoxSettings) -> str | None:
@@ -39,12 +26,6 @@ def _reach(settings: SyncBoxSettings | None, port: str) -> SyncBoxSettings:
     return known.model_copy(update={"port": port})
 
 
-def _fake(now_ns: Callable[[], int], on_train: OnTrain) -> FakeBox:
-    from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
-
-    return FakeSyncBox(now_ns, on_train=on_train)
-
-
 DRIVER = SyncBoxDriver(
     name="sync_box",
     title="SlipLab sync box",
@@ -53,7 +34,7 @@ DRIVER = SyncBoxDriver(
     ping=_ping,
     address=lambda settings: settings.port,
     locks=_locks,
-    build=_build,
-    fake=_fake,
+    build=lazy("sliplab.rigs.devices.sync_box.driver:SerialSyncBox"),
+    fake=lazy("sliplab.rigs.devices.sync_box.fake:FakeSyncBox"),
     reach=_reach,
 )

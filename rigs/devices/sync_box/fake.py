@@ -62,8 +62,8 @@ class FakeSyncBox:
     def __init__(
         self,
         now_ns: Callable[[], int] = time.monotonic_ns,
-        exposure_us: int | None = None,
         on_train: OnTrain = lambda train, sent: None,
+        exposure_us: int | None = None,
     ) -> None:
         self._now_ns, self._exposure_us, self._on_train = now_ns, exposure_us, on_train
         self._master, self._slave = os.openpty()

@@ -25,7 +25,7 @@ from sliplab.rigs.core.fakes import (
     ServedController,
     Stage,
 )
-from sliplab.rigs.devices.ur.fake_program import Safety, UrProgram
+from sliplab.rigs.devices.ur.fake_program import Load, Safety, UrProgram
 from sliplab.rigs.devices.ur.rtde import (
     DATA,
     GET_VERSION,
@@ -214,6 +214,7 @@ class FakeUr(ServedController):
         faults: faults to inject.
         reach_mm: poses farther from the base are outside the safety limits.
         joints_deg: the values of `actual_q`.
+        tool_load: load on the tool; none if left out.
     """
 
     def __init__(
@@ -227,11 +228,19 @@ class FakeUr(ServedController):
         reach_mm: float = 850.0,
         joints_deg: Sequence[float] = JOINTS_DEG,
         clock: ControllerClock | None = None,
+        tool_load: Load | None = None,
     ) -> None:
         super().__init__(host, motion, clock, rate)
         self._cycle_hz = cycle_hz
         self.program = UrProgram(
-            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, faults, self.clock.rate
+            self.motion,
+            reach_mm,
+            joints_deg,
+            digital_inputs,
+            self._cut,
+            faults,
+            self.clock.rate,
+            tool_load,
         )
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []

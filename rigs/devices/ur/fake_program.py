@@ -23,6 +23,9 @@ RUNNING_BIT = 1 << 15
 PROTECTIVE_DECELERATION_MM_S2 = 5000.0
 _CONTROL_MARK = "RTDE Control Script"
 _NUMBER = r"([0-9.eE+-]+)"
+Load = Callable[[float], Sequence[float] | None]
+"""Force and torque on the tool by controller time, base axes, N and N m; None while they are not
+known yet, which holds up the packets that have them."""
 
 
 class Safety(IntEnum):
@@ -53,6 +56,7 @@ class UrProgram:
         cut: called for the faults of the connection.
         faults: faults to inject.
         rate: controller seconds per host second; the watchdog counts the host's seconds.
+        tool_load: load on the tool; none if left out.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class UrProgram:
         cut: Callable[[Kind], None],
         faults: Sequence[Fault] = (),
         rate: float = 1.0,
+        tool_load: Load | None = None,
     ) -> None:
         self.motion, self._reach_mm, self._cut, self._rate = motion, reach_mm, cut, rate
         self.joints_deg = list(joints_deg)
@@ -74,9 +79,7 @@ class UrProgram:
         self.remote = True
         self.runtime = Runtime.STOPPED
         self.tcp = [0.0] * 6
-        self.tool_load: Callable[[float], Sequence[float] | None] = lambda t_s: (0.0,) * 6
-        """Force and torque on the tool by controller time, base axes, N and N m; None while they
-        are not known yet, which holds up the packets that have them."""
+        self.tool_load: Load = tool_load or (lambda t_s: (0.0,) * 6)
         self._zero_load: Sequence[float] = (0.0,) * 6
         self._zeroed_s: float | None = None
         """Time of a request to take the load for zero, until the load of that time is known."""

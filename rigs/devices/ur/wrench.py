@@ -13,7 +13,7 @@ from collections import deque
 import numpy as np
 
 from sliplab.protocols.timing import ForceGrade
-from sliplab.rigs.core.capabilities import ArmState, Mounting, RigError
+from sliplab.rigs.core.capabilities import Arm, ArmState, Mounting, RigError
 from sliplab.rigs.core.pose_stream import BACKLOG_SAMPLES
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.settings import UrWrenchSettings
@@ -25,12 +25,18 @@ Row = tuple[int, int, tuple[float, ...]]
 
 
 class UrWrench:
-    """The wrench of an arm; a `ForceSensor` of `rigs.core.capabilities`."""
+    """The wrench of an arm; a `ForceSensor` of `rigs.core.capabilities`.
+
+    Raises:
+        RigError: the rig's arm is of another driver.
+    """
 
     mounting = Mounting(axes="base", feels="arm")
     grade: ForceGrade = "arm clock"
 
-    def __init__(self, settings: UrWrenchSettings, arm: UrArm) -> None:
+    def __init__(self, settings: UrWrenchSettings, arm: Arm) -> None:
+        if not isinstance(arm, UrArm):
+            raise RigError(DEVICE, "ur_wrench needs the arm of driver: ur")
         self._arm = arm
         self.zeroing = settings.bias
         self._rows: deque[Row] = deque(maxlen=BACKLOG_SAMPLES)

@@ -119,7 +119,9 @@ class VideoPipe:
 class FedCamera(UvcCamera):
     """The driver on a pipe that a scene feeds while the camera is started."""
 
-    def __init__(self, settings: UvcSettings, px_per_mm: float, scene: SceneFrames) -> None:
+    def __init__(
+        self, settings: UvcSettings, px_per_mm: float, scene: SceneFrames, mid_exposure_ns: int = 0
+    ) -> None:
         self._scene = scene
         self._pipe = VideoPipe(settings.width_px, settings.height_px, settings.rate_hz)
         self._shown = 0

@@ -41,7 +41,7 @@ def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> 
 
 LEARNED = detectors.learn([trial(seed) for seed in range(8)], LENGTH, 30)
 FINE = LEARNED.detectors(1 / 3)
-DETECTORS: dict[str, detectors.EvidenceDetector] = {
+DETECTORS: dict[str, detectors.Rule] = {
     "smoothing": Smoothing(4),
     **LEARNED.detectors(1.0),
     "fine": FINE["hmm counts"],
@@ -73,17 +73,15 @@ def test_window_by_window_is_the_whole_to_the_bit(
     name: str, rows: list[tuple[int, ...]], first: int
 ) -> None:
     seen = predictions(np.array(rows).reshape(-1, 3))
-    whole, running = DETECTORS[name].evidence(seen), DETECTORS[name].begin()
+    rule = DETECTORS[name]
+    whole, state = rule.evidence(seen), rule.begin()
     for k in range(len(rows)):
-        one = slice(k, k + 1)
-        incipient, gross = running.step(
-            Predictions(seen.counts[one], seen.events[one], seen.end_ns[one])
-        )
-        assert incipient == whole.incipient[k]
+        state, one = rule.push(state, seen[k : k + 1])
+        assert one.incipient[0] == whole.incipient[k]
         if k > first:
-            assert gross == whole.gross_after(first)[k]
+            assert one.gross_after(-1)[0] == whole.gross_after(first)[k]
         if k == first:
-            running.detected()
+            state = rule.detected(state)
 
 
 @pytest.mark.parametrize("name", DETECTORS)

@@ -14,9 +14,9 @@ from sliplab.analysis.detectors import detectors
 from sliplab.analysis.detectors import live as lives
 from sliplab.analysis.detectors.detectors import (
     Cusum,
-    EvidenceDetector,
     Levels,
     Predictions,
+    Rule,
     StateChain,
     Tuned,
 )
@@ -74,7 +74,7 @@ def events(t_us: list[int] | npt.NDArray[np.int64], seed: int = 0) -> EventChunk
 
 
 def part(chunk: EventChunk, which: object) -> EventChunk:
-    return EventChunk(chunk.x[which], chunk.y[which], chunk.p[which], chunk.t_us[which])  # type: ignore[index]
+    return chunk[which]
 
 
 def offline(chunk: EventChunk, starts_us: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
@@ -133,7 +133,7 @@ def test_the_rule_step_by_step_is_the_rule(
     counts = np.array(rows, np.int64).reshape(-1, 3)
     ends = 30 * np.arange(1, len(counts) + 1, dtype=np.int64)
     whole = detect(counts, ends, rule)
-    running = lives.StepRule(rule)
+    running = lives.RunningRule(rule)
     said = [running.step(row) for row in counts]
     assert [step.valid_class for step in said] == whole.valid_class.tolist()
     assert [step.smoothed for step in said] == [tuple(row) for row in whole.smoothed.tolist()]
@@ -155,13 +155,13 @@ def test_the_rule_step_by_step_is_the_rule(
     st.floats(0.0, 6.0),
 )
 def test_a_detector_step_by_step_decides_as_on_the_whole(
-    rows: list[tuple[int, ...]], detector: EvidenceDetector, level: float
+    rows: list[tuple[int, ...]], detector: Rule, level: float
 ) -> None:
     counts = np.array(rows, np.int64).reshape(-1, 3)
     seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))
     levels = Levels(level, level / 2)
     expected = detectors.decide(detector.evidence(seen), levels)
-    running = lives.StepDetector(Tuned("", detector, levels))
+    running = lives.RunningRule(Tuned("", detector, levels))
     steps = [running.step(row, int(row.sum())) for row in counts]
     found = [next((k for k, it in enumerate(steps) if it.onset == name), None) for name in CLASSES]
     assert found == [None, expected.incipient_ns, expected.gross_ns]
@@ -176,7 +176,7 @@ def test_a_detector_begins_anew_after_a_gap() -> None:
     assert ratio > 0
     level = 1.5 * ratio
     for gap, onset in ((False, "incipient"), (True, None)):
-        running = lives.StepDetector(Tuned("", Cusum(READING), Levels(level, level)))
+        running = lives.RunningRule(Tuned("", Cusum(READING), Levels(level, level)))
         assert running.step(ROW[0], 0).onset is None
         if gap:
             running.interrupt()
@@ -284,7 +284,7 @@ def test_what_is_wrong_is_refused() -> None:
     with pytest.raises(ValueError, match="outside 60 x 50"):
         detector(Network()).push(EventChunk(*(np.array([value]) for value in (60, 0, 1, 0))))
     with pytest.raises(ValueError, match="expected integers"):
-        lives.StepRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
+        lives.RunningRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
 
 
 @given(st.lists(st.integers(0, 5000), min_size=1, max_size=40), st.integers(-(10**12), 10**12))

@@ -8,9 +8,14 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.detectors import onset_references
-from sliplab.analysis.detectors.latency import TrueSlip, score_trial, summarise_latency, true_slip
+from sliplab.analysis.detectors.latency import (
+    DetectedOnsets,
+    TrueSlip,
+    score_trial,
+    summarise_latency,
+    true_slip,
+)
 from sliplab.analysis.detectors.onset_references import Decided, judge_by_reference, references_of
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.storage.schema.evaluation import DetectorRate
 from sliplab.storage.schema.label import OnsetDoubts, TrialLabel
 from sliplab.storage.trials.recording import Recording

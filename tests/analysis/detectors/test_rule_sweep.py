@@ -1,11 +1,10 @@
-"""Every pair of a sweep is the rule's, every figure the summary's, every choice the choice's."""
+"""Every pair of a sweep is the rule's, and every figure is the summary's."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors import rule_sweep
 from sliplab.analysis.detectors.latency import (
     NEVER,
     TrueSlip,
@@ -13,7 +12,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
     summarise_lead,
 )
-from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, choose_pair, score, sweep
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, score, sweep
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.detection import Detection
 
@@ -68,16 +67,6 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[SpikeCounts]) -> No
             lost = sum(any(t.uncounted[2:]) for t in scored)
             assert figures.lost_either * n == pytest.approx(lost)
             assert figures.trials == n
-
-
-@settings(max_examples=30)
-@given(trials(), st.sampled_from((0.0, 0.2, 0.5)))
-def test_the_choice_is_the_evaluations(found: list[SpikeCounts], rate: float) -> None:
-    each, truth = swept(found)
-    s, m = choose_pair(each, truth, SMOOTHINGS, MARGINS, rate)
-    grid = Detection(smoothing_grid=SMOOTHINGS, margin_grid=MARGINS, false_early_rate=rate)
-    expected = rule_sweep.choose_smoothing(found, grid, "validation")
-    assert (SMOOTHINGS[s], MARGINS[m]) == (expected.smoothing, expected.margin)
 
 
 def test_a_trial_shorter_than_the_average_has_no_detection() -> None:

@@ -168,16 +168,16 @@ class Reviewable:
 
     def _write(self, campaign: Campaign, trial: str, condition: dict[str, str]) -> None:
         writer = campaign.begin(trial, (SIZE, SIZE), 100)
-        writer.add_events(events())
+        writer.add("events", events())
         pulses = PulseChunk(START_NS + np.arange(12, dtype=np.int64) * 50_000_000)
-        for add in (writer.add_event_pulses, writer.add_arm_pulses, writer.add_sync_pulses):
-            add(pulses)
+        for device in ("events", "arm", "sync_box"):
+            writer.add(device, pulses)
         times = START_NS + np.arange(50, dtype=np.int64) * 12_000_000
         xyz = np.stack([400 + times / 1e8, times * 0.0, 300 + times * 0.0], axis=1)
-        writer.add_poses(PoseChunk(times, times, xyz, np.zeros((50, 3))))
+        writer.add("arm", PoseChunk(times, times, xyz, np.zeros((50, 3))))
         numbers = np.arange(FRAMES, dtype=np.int64)
         level = np.zeros(FRAMES, np.uint8)
-        writer.add_frames(FrameChunk(pictures(), numbers, frame_times(), frame_times(), level))
+        writer.add("frames", FrameChunk(pictures(), numbers, frame_times(), frame_times(), level))
         self._first = writer.commit(
             TrialRecord.model_validate(record(trial, condition)), Provenance(host="test")
         )

@@ -46,7 +46,7 @@ def rests() -> np.ndarray:
 
 
 def kept(seen: EventChunk, mask: np.ndarray) -> EventChunk:
-    return EventChunk(seen.x[mask], seen.y[mask], seen.p[mask], seen.t_us[mask])
+    return seen[mask]
 
 
 EDGES_US = np.arange(0, 4_000_001, 5_000)

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from sliplab.analysis.detectors import onset_references
-from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, Name, OnsetReference
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
 from sliplab.analysis.report.onsets import Explained, OnsetSection, onset_section
 from sliplab.analysis.report.page import render_section
 from sliplab.storage.schema import evaluation

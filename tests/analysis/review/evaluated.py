@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.detectors.latency import score_trial, true_slip
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
+from sliplab.analysis.detectors.latency import DetectedOnsets, score_trial, true_slip
 from sliplab.analysis.evaluation import evaluation as evaluations
 from sliplab.analysis.evaluation import windows
 from sliplab.analysis.evaluation.trials import summaries

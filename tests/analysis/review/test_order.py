@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.smoothing_rule import DetectedOnsets
+from sliplab.analysis.detectors.latency import DetectedOnsets
 from sliplab.analysis.evaluation.trials import summaries
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import window_groups

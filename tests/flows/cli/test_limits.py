@@ -160,7 +160,7 @@ path = Path(sys.argv[1])
 file = StreamFile(path)
 most = path.stat().st_size + 30_000
 resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
-file.add_events(events(200_000))
+file.add("events", events(200_000))
 try:
     getattr(file, sys.argv[2])()
     print("closed")

@@ -31,7 +31,7 @@ from sliplab.rigs.core.reacting import run_watched
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import NullSink, WrenchChunk
+from sliplab.storage.streams import Chunk, NullSink, WrenchChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -341,8 +341,9 @@ class Watch(NullSink):
     def step(self, phase: str, acting: bool) -> None:
         """A step begins."""
 
-    def add_stream(self, name: str, chunk: WrenchChunk) -> None:
-        self.forces.append(chunk)
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, WrenchChunk):
+            self.forces.append(chunk)
 
 
 def test_a_watched_trial_presses_to_its_force_and_stays_as_deep(tmp_path: Path) -> None:

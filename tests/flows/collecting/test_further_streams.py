@@ -287,7 +287,7 @@ def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
     # killed in the second trial: its files stay behind, and go to quarantine
     trial = pending_trials(part.plan, pieces)[0]
     writer = pieces.begin(trial.id, None, 100)
-    writer.add_stream("side", whole.rig.further[0].device.read())
+    writer.add("side", whole.rig.further[0].device.read())
     assert (writer.folder / "stream-side.h5").exists()
     again, pieces = session(tmp_path / "b", streams, data=data)
     take_all(again)

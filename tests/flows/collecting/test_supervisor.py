@@ -65,12 +65,15 @@ def after_first(work: TrialCollector, do: Callable[[], object]) -> list[tuple[st
     return outcomes
 
 
-def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path) -> None:
+def test_a_pause_stands_still_between_trials_and_changes_no_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain, untouched = session(tmp_path / "plain", short())
     plain.take(pending_trials(plain.plan, untouched))
     work, campaign, store = supervised(tmp_path / "a")
     waits: list[float] = []
     pauses: list[float] = []
+    reasons: list[str] = []
     during: list[int] = []
 
     def wait(seconds: float) -> None:
@@ -79,10 +82,16 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
         if len(waits) == 3:
             control.ask(store, "resume", who="ben")
 
-    work.supervisor.wait, work.supervisor.on_pause = wait, pauses.append
+    work.supervisor.wait = wait
+    monkeypatch.setattr(work.supervisor.listener, "on_paused", reasons.append)
+    monkeypatch.setattr(work.supervisor.listener, "on_resumed", pauses.append)
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
     assert pauses == [3 * supervising.POLL_S]
+    (reason,) = reasons
+    assert reason.startswith("paused before ")
+    assert "anna" in reason
+    assert "lunch" in reason
     asked = control.requests(store)
     known = [(item.kind, item.who, item.why) for item in asked]
     assert known == [("pause", "anna", "lunch"), ("resume", "ben", "")]

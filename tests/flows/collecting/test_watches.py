@@ -92,7 +92,7 @@ def test_references_that_drift_apart_stop_the_campaign(
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
     monkeypatch.setattr(
-        "sliplab.flows.collecting.watches.hold_rate", lambda recording: rates[recording.trial_id]
+        "sliplab.analysis.references.hold_rate", lambda recording: rates[recording.trial_id]
     )
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
@@ -145,7 +145,7 @@ def test_without_the_gate_nothing_is_compared(
     def never(recording: object) -> float:
         raise AssertionError("read")
 
-    monkeypatch.setattr("sliplab.flows.collecting.watches.hold_rate", never)
+    monkeypatch.setattr("sliplab.analysis.references.hold_rate", never)
     work.supervisor = CollectionSupervisor(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign)[:3])
     ReferenceWatch(run_request, campaign).begin()

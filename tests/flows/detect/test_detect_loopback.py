@@ -8,9 +8,9 @@ import pytest
 
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
-from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
 from tests.flows.detect.detecting import model_in, short_slide, slip_when_busy

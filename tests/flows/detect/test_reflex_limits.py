@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program
-from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.path import SENSOR
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.truth import COURSE, plate_course, watch_plate
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.streams import NullSink, PoseChunk
+from sliplab.storage.streams import Chunk, NullSink, PoseChunk
 from tests.conftest import ROOT
 
 FILE = load_rig_file(ROOT / "rigs" / "mock_gripper.yaml")[0]
@@ -50,8 +50,10 @@ class Drawn(NullSink):
             watch_plate(self._devices.world)
             self.began_ns = self._devices.clock.now_ns()
 
-    def add_poses(self, chunk: PoseChunk) -> None:
+    def add(self, device: str, chunk: Chunk) -> None:
         """Raise what is due."""
+        if not isinstance(chunk, PoseChunk):
+            return
         passed_s = (self._devices.clock.now_ns() - self.began_ns) / 1e9
         if passed_s < self._due_s:
             return

@@ -126,7 +126,7 @@ def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(gripping: Grip
             if rig.position().x_mm <= -2.0:
                 return waiting.pop(0)[1]
             if next(reads) % 2:
-                return type(new)(*(column[:0] for column in vars(new).values()))
+                return new[:0]
             ages_ms.append((now_ns - waiting[0][0]) / 1e6)
             return waiting.pop(0)[1]
 
@@ -230,7 +230,7 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
                 return EventChunk(**kept | {"t_us": np.full(len(chunk), stamps[-1], np.int64)})
             if len(chunk):
                 stamps.append(int(chunk.t_us.max()))
-            return EventChunk(*(column[:0] for column in vars(chunk).values()))
+            return chunk[:0]
 
         stamps = [0]
         rig.events.read = events  # type: ignore[method-assign]

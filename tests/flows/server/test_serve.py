@@ -77,6 +77,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     service: Service, server: EmbeddedServer, protocol: Path
 ) -> None:
     from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import LogFilter, LogFilterFlowRunId
 
     from sliplab.flows.server.deployments import collect
 
@@ -84,6 +85,11 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
         sign_rig(client, "rehearsal", True)  # as a killed program left it
         state = collect(Collect(protocol=protocol, trials=3), return_state=True)
         limit = client.read_global_concurrency_limit_by_name("rig rehearsal")
+        run = client.read_flow_run(state.state_details.flow_run_id)
+        own = LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id]))
+        lines = [line.message for line in client.read_logs(own, limit=100, offset=0)]
+    assert run.name == "collect crash on rehearsal, 3 simulated trials"
+    assert sum(line.endswith(" committed") for line in lines) == 3
     assert state.type.value == "COMPLETED"
     assert "3 of 4 committed, 1 missing" in state.message
     (end,) = ends(service)

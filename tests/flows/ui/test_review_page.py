@@ -24,7 +24,7 @@ from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 
 TRIALS = 864
-pytestmark = needs_browser
+pytestmark = [pytest.mark.programs, needs_browser]
 expect = sync_api.expect
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import softmax
 
+from sliplab.analysis.detectors.detectors import Predictions
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import INCIPIENT
 from sliplab.analysis.windows.sparse import SparseWindows
@@ -309,7 +311,9 @@ def test_the_papers_entry_speaks_where_the_published_rule_does() -> None:
     ends = 30_000_000 * np.arange(1, 301)
     expected = detect(counts, ends, rule).valid_class == INCIPIENT
     paper.restart()
-    found = np.concatenate([paper.evidence(part) for part in np.split(counts, [1, 2, 40, 41])])
+    windows = Predictions(counts, counts.sum(axis=1), ends)
+    cuts = pairwise([0, 1, 2, 40, 41, 300])
+    found = np.concatenate([paper.read(windows[a:b]) for a, b in cuts])
     assert expected.any()
     assert np.array_equal(found > -np.inf, expected)
     assert (found[expected] >= 2.0).all()

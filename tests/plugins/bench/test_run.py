@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,9 +21,25 @@ TINY = Size(ScenePart(1, 2, 0), ScenePart(1, 3, 0), ScenePart(2, 2, 0), 1)
 NAMES = ("rate", "always", "random")
 
 
+@pytest.fixture(scope="module")
+def simulated() -> Callable[[scenes.SceneDraw], Scene]:
+    """Simulate each scene once for all tests."""
+    found: dict[tuple[str, int], Scene] = {}
+    simulate = scenes.simulated
+
+    def once(drawn: scenes.SceneDraw) -> Scene:
+        key = drawn.name, drawn.seed
+        if key not in found:
+            found[key] = simulate(drawn)
+        return found[key]
+
+    return once
+
+
 @pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+def tiny(monkeypatch: pytest.MonkeyPatch, simulated: Callable[[scenes.SceneDraw], Scene]) -> None:
     monkeypatch.setitem(SIZES, "small", TINY)
+    monkeypatch.setattr(scenes, "simulated", simulated)
     run._bench.cache_clear()
 
 
@@ -52,10 +68,12 @@ def test_other_test_worlds_change_figures_and_no_choice(folder: Path) -> None:
 
 
 def test_choices_are_made_before_a_test_scene_is_there(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    simulated: Callable[[scenes.SceneDraw], Scene],
 ) -> None:
     done: list[str] = []
-    simulated, validated = scenes.simulated, run.validated
+    validated = run.validated
 
     def simulate(drawn: scenes.SceneDraw) -> Scene:
         done.append(drawn.name.split()[0])

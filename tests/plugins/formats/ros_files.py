@@ -60,7 +60,7 @@ def sent(count: int = 2000, *, seed: int = 3) -> EventChunk:
 def parts(chunk: EventChunk, size: int = 250) -> list[EventChunk]:
     """Cut events into packets."""
     cuts = range(0, len(chunk), size)
-    return [EventChunk(*(c[low : low + size] for c in vars(chunk).values())) for low in cuts]
+    return [chunk[low : low + size] for low in cuts]
 
 
 def of(store: Any, t_ns: int) -> Any:

@@ -7,6 +7,7 @@ import shutil
 import struct
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,11 @@ from sliplab.storage.schema.trial import Provenance, SyncResult, TrialClockMaps
 from sliplab.storage.streams import (
     ClockReads,
     EventChunk,
-    FrameChunk,
+    ExposureChunk,
     Json,
     PulseChunk,
     ScalarChunk,
+    TriggerChunk,
     WrenchChunk,
 )
 from sliplab.storage.trials.catalogue import catalogue
@@ -87,15 +89,15 @@ def rich(tmp_path_factory: pytest.TempPathFactory) -> Store:
     fill(writer)
     rows = np.arange(40, dtype=np.int64)
     turns = np.random.default_rng(2).normal(size=(40, 3))
-    writer.add_stream("force", WrenchChunk(rows * 10**6, rows, turns, -turns))
-    writer.add_stream("warm", ScalarChunk(rows * 10**7, rows, turns[:, 0], "°C"))
-    writer.add_stream("side", events(3000, seed=4))
-    writer.add_stream("side", PulseChunk(rows * 1000))
-    writer.add_stream("back", frames(9, seed=5))
-    writer.add_stream("back", ClockReads(rows, rows - 1, rows + 1))
-    writer.add_box_reads(ClockReads(rows, rows - 1, rows + 1))
-    writer.add_exposures(PulseChunk(rows))
-    writer.add_triggers(rows * 1000, np.ones(40, np.uint8))
+    writer.add("force", WrenchChunk(rows * 10**6, rows, turns, -turns))
+    writer.add("warm", ScalarChunk(rows * 10**7, rows, turns[:, 0], "°C"))
+    writer.add("side", events(3000, seed=4))
+    writer.add("side", PulseChunk(rows * 1000))
+    writer.add("back", frames(9, seed=5))
+    writer.add("back", ClockReads(rows, rows - 1, rows + 1))
+    writer.add("sync_box", ClockReads(rows, rows - 1, rows + 1))
+    writer.add("sync_box", ExposureChunk(rows))
+    writer.add("events", TriggerChunk(rows * 1000, np.ones(40, np.uint8)))
     plain = record("t").to_json()
     clock = {"map": IDENTITY, "uncertainty_ns": 2000.0}
     clocks = {
@@ -538,7 +540,7 @@ def test_a_frame_without_a_clock_is_kept(tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer, with_frames=False)
     late = frames(12)
-    writer.add_frames(FrameChunk(late.images, late.number, late.t_ns + 7, late.host_ns, late.sync))
+    writer.add("frames", replace(late, t_ns=late.t_ns + 7))
     clocks = {"reference": "sync box", "events": {"map": IDENTITY}}
     writer.commit(record("t", clocks=clocks), Provenance())
     ours = Store.open(tmp_path / "store")

@@ -87,7 +87,7 @@ def listed(trial: ForeignTrial) -> list[Row]:
 
 def listed_of(chunks: list[EventChunk]) -> list[Row]:
     """Events as (time, column, row, polarity)."""
-    whole = EventChunk.joined(chunks)
+    whole = EventChunk.concatenate(chunks)
     assert [vars(whole)[name].dtype for name in ("x", "y", "p", "t_us")] == ["u2", "u2", "u1", "i8"]
     return list(zip(*(c.tolist() for c in (whole.t_us, whole.x, whole.y, whole.p)), strict=True))
 

@@ -265,7 +265,7 @@ def test_a_broken_message_costs_itself(tmp_path: Path, writer: str, encoding: st
     else:
         kept = ros.parts(sent)
         del kept[3]
-        assert_events(found, EventChunk.joined(kept))
+        assert_events(found, EventChunk.concatenate(kept))
     assert found.record.imported is not None
     first, second = found.record.imported.warnings
     assert first.startswith(f"1 of 8 messages of {topic} are left out; the first one holds a mess")
@@ -280,7 +280,7 @@ def test_events_outside_of_the_camera_are_left_out_and_counted(tmp_path: Path) -
         ros.write_mcap(path, ros.packets(ROS2, encoding, sent))
         result, (found,) = take(tmp_path / encoding, path)
         inside = sent.x < SIZE[0]
-        assert_events(found, EventChunk(*(c[inside] for c in vars(sent).values())))
+        assert_events(found, sent[inside])
         assert result["warnings"] == [f"{path.name}: 3 events outside of the sensor left out"]
         assert found.record.imported is not None
         assert found.record.imported.dropped == {"events outside of the sensor": 3}
@@ -340,7 +340,7 @@ def test_a_database_that_is_cut_short_is_salvaged(tmp_path: Path) -> None:
     assert "; --salvage imports " in said
     result, (found,) = take(tmp_path / "saved", path, salvage=True)
     assert 10_000 < result["events"] < 30_000
-    assert_events(found, EventChunk(*(c[: result["events"]] for c in vars(sent).values())))
+    assert_events(found, sent[: result["events"]])
     assert result["salvaged"][0]["reason"].startswith("is cut short: it has ")
 
 

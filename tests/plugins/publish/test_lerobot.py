@@ -34,14 +34,14 @@ START_NS = int(events(1000).t_us[0]) * 1000
 def _trial(where: Any, name: str, shift: int = 0) -> None:
     """A trial of 1,000 events in 0.1 s, with 12 frames, 50 poses and 50 forces around them."""
     writer = where.begin(name, FRAME, 100)
-    writer.add_events(events(1000, seed=shift))
+    writer.add("events", events(1000, seed=shift))
     times = START_NS + np.arange(50, dtype=np.int64) * 2_100_000
     turns = np.outer(np.linspace(0, 90, 50), [0, 0, 1.0])
-    writer.add_poses(PoseChunk(times, times, np.arange(150.0).reshape(50, 3) + shift, turns))
+    writer.add("arm", PoseChunk(times, times, np.arange(150.0).reshape(50, 3) + shift, turns))
     forces = np.stack([np.linspace(0, 1, 50)] * 3, 1)
-    writer.add_stream("force", WrenchChunk(times, times, forces, -forces))
+    writer.add("force", WrenchChunk(times, times, forces, -forces))
     shown = frames(12, seed=shift)
-    writer.add_frames(type(shown)(**{**vars(shown), "t_ns": START_NS + shown.t_ns}))
+    writer.add("frames", type(shown)(**{**vars(shown), "t_ns": START_NS + shown.t_ns}))
     clock = {"map": IDENTITY, "uncertainty_ns": 1.0}
     clocks = {
         "events": clock,

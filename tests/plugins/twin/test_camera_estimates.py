@@ -122,7 +122,9 @@ def swept(angle: float, depth: float, rng: np.random.Generator) -> PilotTrial:
         y, x, p = (np.repeat(a, np.abs(more)) for a in (y, x, more > 0))
         parts.append((rng.uniform(step - 1, step, len(x)) * 2e6 / 12, x, y, p))
         seen = now
-    events = EventChunk.joined([chunk(*map(np.concatenate, zip(*parts, strict=True))), noise(rng)])
+    events = EventChunk.concatenate(
+        [chunk(*map(np.concatenate, zip(*parts, strict=True))), noise(rng)]
+    )
     made = trial(chunk(events.t_us, events.x, events.y, events.p), depth=depth, angle=angle)
     t_s = np.arange(HOLD_S, SLIDE_S, 0.001)
     force = np.zeros((len(t_s), 3))
@@ -169,9 +171,9 @@ def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
         passed = EventChunk(
             x.astype(np.uint16), (y + 1).astype(np.uint16), np.ones(400, np.int8), t_us
         )
-        both = EventChunk.joined([made.camera.events, *[passed] * 6])
+        both = EventChunk.concatenate([made.camera.events, *[passed] * 6])
         order = np.argsort(both.t_us, kind="stable")
-        events = EventChunk(both.x[order], both.y[order], both.p[order], both.t_us[order])
+        events = both[order]
         found.append(replace(made, camera=replace(made.camera, events=events)))
     before, after = camera_estimates(pilot()), camera_estimates(found)
     assert after["hot_pixels"] == before["hot_pixels"] == 5
@@ -289,7 +291,7 @@ def only(made: PilotTrial, kept: np.ndarray) -> PilotTrial:
     """A trial with some of its events."""
     assert made.camera is not None
     seen = made.camera.events
-    events = EventChunk(seen.x[kept], seen.y[kept], seen.p[kept], seen.t_us[kept])
+    events = seen[kept]
     return replace(made, camera=SlideEvents(events, made.camera.size_px))
 
 

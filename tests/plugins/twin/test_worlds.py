@@ -12,8 +12,8 @@ import pytest
 from sliplab.flows.scene_runs import changed
 from sliplab.plugins.twin.pilots import zero_error_mm
 from sliplab.plugins.twin.worlds import touch_depth_mm
-from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.mock.devices import build_mock
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 

@@ -65,7 +65,7 @@ def test_a_force_that_rises_evenly_is_reached_when_the_line_says() -> None:
         chunks, first = [], 0
         for part in parts:
             rows = slice(first, first + len(part))
-            chunks.append(WrenchChunk(*(column[rows] for column in vars(whole).values())))
+            chunks.append(whole[rows])
             first += len(part)
         found = watch(*chunks)
         assert found.seconds_to(2.0, round(300.5 * MS)) == pytest.approx(0.1995, abs=1e-6)

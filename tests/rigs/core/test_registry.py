@@ -14,7 +14,7 @@ from sliplab.protocols.yaml_file import validate
 from sliplab.rigs.core import registry
 from sliplab.rigs.core.driver import ArmDriver, EventCameraDriver
 from sliplab.rigs.core.registry import DriverError, find_driver, listed
-from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.device_section import DeviceSettings
 
 CAMERA = '''
 from typing import Literal

@@ -22,18 +22,27 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import (
-    ClockReads,
+    Chunk,
     EventChunk,
     FrameChunk,
     NullSink,
     PoseChunk,
-    PulseChunk,
-    StreamChunk,
+    WrenchChunk,
 )
 from tests.conftest import ROOT, SMALL
 
 RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
 FRAME_PX = (256, 256)
+
+
+NAMES = {
+    ("events", "pulses"): "event pulses",
+    ("arm", "pulses"): "arm pulses",
+    ("sync_box", "pulses"): "sync pulses",
+    ("sync_box", "exposures"): "exposures",
+    ("sync_box", "reads"): "box reads",
+    ("frames", "reads"): "frame camera reads",
+}
 
 
 class Memory:
@@ -47,44 +56,29 @@ class Memory:
     def _keep(self, name: str, values: np.ndarray) -> None:
         self.parts.setdefault(name, []).append(values)
 
-    def add_events(self, chunk: EventChunk) -> None:
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, EventChunk):
+            self.keep_events(chunk)
+        elif isinstance(chunk, PoseChunk):
+            self._keep("pose times", chunk.t_ns)
+            self._keep("poses", chunk.xyz_mm)
+        elif isinstance(chunk, FrameChunk):
+            self._keep("frame numbers", chunk.number)
+            self._keep("frame times", chunk.t_ns)
+            self._keep("frames", chunk.images)
+        elif isinstance(chunk, WrenchChunk):
+            self._keep(f"{device} times", chunk.t_ns)
+            self._keep(f"{device} forces", chunk.force_n)
+        else:
+            self._keep(NAMES[device, chunk.KIND.name], chunk.times)
+
+    def keep_events(self, chunk: EventChunk) -> None:
         self.calls += 1
         if self.fail_after is not None and self.calls > self.fail_after:
             assert self.error is not None
             raise self.error
         for name in ("x", "y", "p", "t_us"):
             self._keep(f"events {name}", getattr(chunk, name))
-
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        self._keep("event pulses", chunk.t_ns)
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        self._keep("arm pulses", chunk.t_ns)
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        self._keep("sync pulses", chunk.t_ns)
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        self._keep("exposures", chunk.t_ns)
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        self._keep("box reads", chunk.device_ns)
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        self._keep("frame camera reads", chunk.device_ns)
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        self._keep("pose times", chunk.t_ns)
-        self._keep("poses", chunk.xyz_mm)
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        self._keep("frame numbers", chunk.number)
-        self._keep("frame times", chunk.t_ns)
-        self._keep("frames", chunk.images)
-
-    def add_stream(self, name: str, chunk: StreamChunk) -> None:
-        self._keep(f"{name} times", chunk.t_ns)
-        self._keep(f"{name} forces", chunk.force_n)
 
     def all(self, name: str) -> np.ndarray:
         return np.concatenate(self.parts[name])
@@ -282,14 +276,14 @@ def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
 
 
 def test_depth_zero_is_the_mean_of_as_many_touches_as_asked_for() -> None:
-    """Of eight touches it is within four standard errors of the mean of 24 others."""
+    """Of three touches it is within four standard errors of the mean of 9 others."""
     rig = make_rig(**FAR_CAMERA)
-    others = [rig.touch_off(0.5, 1.5, seed) for seed in range(100, 124)]
-    asked = Rezero.model_validate({**REZERO, "touches": 8})
+    others = [rig.touch_off(0.5, 1.5, seed) for seed in range(100, 109)]
+    asked = Rezero.model_validate({**REZERO, "touches": 3})
     found = rig.rezero(asked, 1)
     assert rig.plate_frame.zero_mm == found.mm
     assert found.sd_mm == pytest.approx(np.std(others, ddof=1), rel=1.0)
-    error = float(np.std(others, ddof=1)) * (1 / 8 + 1 / 24) ** 0.5
+    error = float(np.std(others, ddof=1)) * (1 / 3 + 1 / 9) ** 0.5
     assert found.mm == pytest.approx(np.mean(others), abs=4 * error)
     assert rig.rezero(asked, 1) == found  # by its seed
     assert rig.rezero(asked, 2) != found

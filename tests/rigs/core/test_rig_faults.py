@@ -52,7 +52,7 @@ def test_whoever_stops_the_rig_hears_that_the_arm_could_not_be(error: BaseExcept
         wait(1.0)
         raise error
 
-    sink.add_events = slow_disk  # type: ignore[method-assign]
+    sink.keep_events = slow_disk  # type: ignore[method-assign]
     notes = watched(rig)
     with pytest.raises(ArmFault, match="does not answer") as caught:
         run(rig, short_plan(), sink)
@@ -167,13 +167,13 @@ def test_ctrl_c_while_the_arm_moves_clear_stops_it(rig: Any) -> None:
 
     failed = [False]
     sink = Memory(fail_after=3, error=OSError("disk full"))
-    keep = sink.add_events
+    keep = sink.keep_events
 
     def full(chunk: Any) -> None:
         failed[0] = sink.calls >= 3
         keep(chunk)
 
-    sink.add_events = full  # type: ignore[method-assign]
+    sink.keep_events = full  # type: ignore[method-assign]
     rig.arm.start, rig.clock.wait = noted, interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         run(rig, short_plan(), sink)
@@ -194,7 +194,7 @@ def test_an_arm_that_does_not_come_clear_is_told_of(rig: Any) -> None:
         raise OSError("disk full")
 
     sink = Memory()
-    sink.add_events = full  # type: ignore[method-assign]
+    sink.keep_events = full  # type: ignore[method-assign]
     rig.arm.start = hindered  # type: ignore[method-assign]
     with pytest.raises(ArmFault, match="did not come clear of the plate"):
         run(rig, short_plan(), sink)

@@ -24,7 +24,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
-from sliplab.storage.streams import EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
+from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 from tests.conftest import ROOT
 from tests.rigs.altered import alter, before, depths
 
@@ -69,8 +69,8 @@ class Watcher(NullSink):
     def step(self, phase: str, acting: bool) -> None:
         """A step begins."""
 
-    def add_poses(self, chunk: PoseChunk) -> None:
-        if self.armed and self._slip:
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, PoseChunk) and self.armed and self._slip:
             raise SlipDetected
 
 
@@ -784,7 +784,7 @@ def stops_at(rig: Rig, depth_mm: float, then: Callable[[EventChunk], EventChunk]
 
 
 def nothing(chunk: EventChunk) -> EventChunk:
-    return EventChunk(*(column[:0] for column in vars(chunk).values()))
+    return chunk[:0]
 
 
 def frozen(chunk: EventChunk) -> EventChunk:

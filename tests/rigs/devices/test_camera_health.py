@@ -116,7 +116,7 @@ def test_a_thermometer_is_read_where_there_is_one(monkeypatch: pytest.MonkeyPatc
 
 def test_neither_library_is_loaded_before_a_camera_is_opened() -> None:
     code = (
-        "import sys, sliplab.rigs.devices.settings, sliplab.rigs.devices.basler.driver; "
+        "import sys, sliplab.rigs.device_section, sliplab.rigs.devices.basler.driver; "
         "sys.exit('pypylon' in sys.modules or 'dv_processing' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

@@ -203,18 +203,18 @@ def test_a_full_disk_stays_full_for_the_trial() -> None:
     class Sink:
         written = 0
 
-        def add_frames(self, chunk: Any) -> None:
+        def add(self, device: str, chunk: Any) -> None:
             self.written += 1
 
     devices = with_faults({"kind": "disk_full", "since": "trial", "at_s": 1.0, "trial": 1})
     devices.begin_trial(1)
     bare = Sink()
     sink: Any = devices.sink(bare)  # type: ignore[arg-type]
-    sink.add_frames(None)
+    sink.add("frames", None)
     devices.clock.wait(1.0)
     for _ in range(2):
         with pytest.raises(OSError, match="No space left") as caught:
-            sink.add_frames(None)
+            sink.add("frames", None)
         assert caught.value.errno == errno.ENOSPC
     assert bare.written == 1
     devices.begin_trial(2)

@@ -14,7 +14,7 @@ import numpy as np
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.flatbuffers import events_buffer
-from sliplab.storage.formats.foreign import Triggers, part_of
+from sliplab.storage.formats.foreign import Triggers
 from sliplab.storage.streams import EventChunk
 
 COUNT, PACKET = 3000, 100
@@ -42,7 +42,7 @@ def write_aedat4(path: Path) -> None:
     whole = all_events()
     with Aedat4Writer(path, streams) as file:
         for number, low in enumerate(range(0, COUNT, PACKET)):
-            file._write(0, events_buffer(part_of(whole, low, low + PACKET)))
+            file._write(0, events_buffer(whole[low : low + PACKET]))
             t_us = int(whole.t_us[low])
             file.triggers(2, Triggers(np.array([t_us]), np.array([1], np.uint8)))
             if number % 10 == 0:
@@ -97,7 +97,7 @@ def write_mcap(path: Path, chunk_bytes: int = 2000) -> None:
             schema = writer.register_schema(kind, "ros2msg", ros2.definition(kind))
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for seq, low in enumerate(range(0, COUNT, PACKET)):
-            part = part_of(whole, low, low + PACKET)
+            part = whole[low : low + PACKET]
             t_ns = int(part.t_us[0]) * 1000
             data = ros2.event_packet(t_ns, "dvs", SIZE, seq, part)
             writer.add_message(channels["/dvs/events"], t_ns, data, t_ns, seq)

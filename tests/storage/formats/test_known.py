@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,8 @@ from sliplab.protocols.plugin import Plugin, Plugins, plugins
 from sliplab.storage.formats import known
 from sliplab.storage.formats.known import known_format, known_formats
 from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
-from tests.protocols.test_plugin import loaded
+from tests.protocols.planning import said_by
+from tests.protocols.test_plugin import LOADED
 from tests.storage.formats.recordings import write_aedat4
 
 TICKS = """
@@ -106,11 +108,13 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
 
 def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4")
-    file, store = str(tmp_path / "a.aedat4"), str(tmp_path / "store")
-    found = loaded("import", file, "--store", store, "--name", "a")
+    file, store, out = (str(tmp_path / name) for name in ("a.aedat4", "store", "out"))
+    commands = [
+        ("import", file, "--store", store, "--name", "a"),
+        ("export", store, "a", "--format", "aedat4", "--output", out),
+    ]
+    said = said_by(LOADED, json.dumps(commands)).splitlines()
+    *_, found = (json.loads(line) for line in said if line.startswith("["))
     assert "sliplab.plugins.formats.lab.layout" in found  # a run's folder may lie around the file
     for name in ("prophesee", "event_stream", "ros.mcap", "ros.bags", "lerobot"):
         assert f"sliplab.plugins.formats.{name}" not in found
-    out = str(tmp_path / "out")
-    found = loaded("export", store, "a", "--format", "aedat4", "--output", out)
-    assert not [name for name in found if name.startswith("sliplab.plugins.formats.")]

@@ -61,11 +61,11 @@ def send(writer: TrialWriter) -> None:
     fill(writer)
     for low in range(0, len(SIDE), 1000):
         rows = slice(low, low + 1000)
-        writer.add_stream("side", type(SIDE)(*(v[rows] for v in vars(SIDE).values())))
-    writer.add_stream("side", PULSES)
-    writer.add_stream("back", BACK)
-    writer.add_stream("back", READS)
-    writer.add_stream("warm", WARM)
+        writer.add("side", SIDE[rows])
+    writer.add("side", PULSES)
+    writer.add("back", BACK)
+    writer.add("back", READS)
+    writer.add("warm", WARM)
 
 
 def taken(folder: Path, *, spool: bool = False) -> Path:
@@ -138,7 +138,7 @@ def test_the_trials_own_file_is_as_without_further_cameras(tmp_path: Path) -> No
     plain = commit(campaign(tmp_path / "plain"), "t")
     writer = campaign(tmp_path / "more").begin("t", FRAME, 100)
     fill(writer)
-    writer.add_stream("side", SIDE)
+    writer.add("side", SIDE)
     folder = writer.seal()
     for name in ("data.h5", "frames.mkv"):
         assert (folder / name).read_bytes() == (plain / name).read_bytes()
@@ -153,11 +153,11 @@ def test_the_same_streams_are_the_same_bytes(tmp_path: Path) -> None:
 
 def test_a_stream_keeps_its_kind_and_its_name(tmp_path: Path) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
-    writer.add_stream("side", PULSES)
+    writer.add("side", PULSES)
     with pytest.raises(ValueError, match="'side': is of kind 'events', not 'frames'"):
-        writer.add_stream("side", BACK)
+        writer.add("side", BACK)
     with pytest.raises(ValueError, match="a name must match"):
-        writer.add_stream("../side", SIDE)
+        writer.add("../side", SIDE)
     writer.discard()
 
 
@@ -251,11 +251,11 @@ def test_scalars_are_no_wrenches(tmp_path: Path) -> None:
     writer = campaign(tmp_path / "u").begin("t", FRAME, 100)
     units = {"plain": "", "long": "\N{OHM SIGN}" * 20}
     for name, unit in units.items():
-        writer.add_stream(name, ScalarChunk(WARM.t_ns, WARM.host_ns, WARM.value, unit))
+        writer.add(name, ScalarChunk(WARM.t_ns, WARM.host_ns, WARM.value, unit))
     with StreamReader(writer.seal() / "data.h5") as reader:
         assert {name: reader.scalars(name).unit for name in units} == units
     writer = campaign(tmp_path / "f").begin("t", FRAME, 100)
-    writer.add_stream("warm", WARM)
+    writer.add("warm", WARM)
     with pytest.raises(ValueError, match="is of kind 'scalar', not 'wrench'"):
-        writer.add_stream("warm", WrenchChunk.empty())
+        writer.add("warm", WrenchChunk.empty())
     writer.discard()

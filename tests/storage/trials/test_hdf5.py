@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.storage.streams import EventChunk
+from sliplab.storage.streams import EventChunk, PulseChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import COLUMNS, SMALL_HELD, StreamFile
 from tests.storage.trial_files import events
@@ -19,7 +19,7 @@ def write(path: Path, whole: EventChunk, pieces: int) -> None:
     """Write events in pieces of equal size."""
     file = StreamFile(path)
     for rows in np.array_split(np.arange(len(whole)), pieces):
-        file.add_events(EventChunk(whole.x[rows], whole.y[rows], whole.p[rows], whole.t_us[rows]))
+        file.add("events", whole[rows])
     file.finish()
 
 
@@ -71,9 +71,9 @@ def test_a_window_is_what_a_mask_would_give(start: int, end: int) -> None:
 
 def test_times_that_run_backwards_are_refused(tmp_path: Path) -> None:
     file = StreamFile(tmp_path / "t.h5")
-    file.add_events(events(10))
+    file.add("events", events(10))
     with pytest.raises(ValueError, match="backwards"):
-        file.add_events(events(10))
+        file.add("events", events(10))
     file.abandon()
 
 
@@ -97,7 +97,7 @@ def test_times_longer_than_32_bits_are_kept_in_64(before: int, tmp_path: Path) -
     late = events(70_000, start_us=int(first.t_us[-1]) + gap - 500)
     file = StreamFile(tmp_path / "t.h5")
     for chunk in (first, late):
-        file.add_events(chunk)
+        file.add("events", chunk)
     file.finish()
     wanted = np.concatenate([first.t_us, late.t_us])
     assert wanted[-1] - wanted[0] > 2**32
@@ -144,8 +144,8 @@ def test_small_columns_come_back_from_beyond_what_is_held(tmp_path: Path) -> Non
     times = np.arange(2 * SMALL_HELD + 5, dtype=np.int64)
     file = StreamFile(tmp_path / "t.h5")
     for start in range(0, len(times), 1000):
-        file.append("arm_pulses", t=times[start : start + 1000])
-    file.append("sync_pulses", t=times)
+        file.add("arm", PulseChunk(times[start : start + 1000]))
+    file.add("sync_box", PulseChunk(times))
     assert file.counts["arm_pulses/t"] == len(times)
     file.finish()
     with StreamReader(tmp_path / "t.h5") as reader:

@@ -50,8 +50,8 @@ def write(writer: TrialWriter, pieces: int) -> Path:
     fill(writer)
     edges = np.linspace(0, COUNT, pieces + 1).astype(int).tolist()
     for low, high in pairwise(edges):
-        writer.add_stream("force", cut(ALL, slice(low, high)))
-    writer.add_stream("arm_force", cut(ALL, slice(0, 300)))
+        writer.add("force", cut(ALL, slice(low, high)))
+    writer.add("arm_force", cut(ALL, slice(0, 300)))
     known = record("t", streams=said(force=COUNT, arm_force=300))
     return writer.commit(known, Provenance())
 
@@ -92,7 +92,7 @@ def test_nothing_is_made_where_nothing_comes(tmp_path: Path) -> None:
     for name in ("plain", "empty"):
         writer = where.begin(name, FRAME, 100)
         if name == "empty":
-            writer.add_stream("force", WrenchChunk.empty())
+            writer.add("force", WrenchChunk.empty())
         fill(writer)
         data.append(writer.commit(record(name), Provenance()))
     assert (data[0] / "data.h5").read_bytes() == (data[1] / "data.h5").read_bytes()
@@ -119,12 +119,12 @@ def test_a_record_knows_the_clock_of_a_stream() -> None:
 def test_a_name_is_a_small_identifier(name: str, tmp_path: Path) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     with pytest.raises(ValueError, match="a name must match"):
-        writer.add_stream(name, ALL)
+        writer.add(name, ALL)
     writer.discard()
 
 
 def test_a_sink_that_drops_everything_drops_them() -> None:
-    NullSink().add_stream("force", ALL)
+    NullSink().add("force", ALL)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_verify_holds_file_and_record_against_each_other(
 ) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     fill(writer)
-    writer.add_stream("force", cut(ALL, slice(0, rows)))
+    writer.add("force", cut(ALL, slice(0, rows)))
     writer.commit(record("t", **({"streams": streams} if streams else {})), Provenance())
     assert any(problem in found.what for found in verify(Store.open(tmp_path / "s")))
 
@@ -149,8 +149,8 @@ def test_verify_holds_file_and_record_against_each_other(
 def test_verify_sees_a_clock_that_runs_backwards(tmp_path: Path) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     fill(writer)
-    writer.add_stream("force", cut(ALL, slice(0, 2)))
-    writer.add_stream("force", cut(ALL, slice(0, 1)))
+    writer.add("force", cut(ALL, slice(0, 2)))
+    writer.add("force", cut(ALL, slice(0, 1)))
     writer.commit(record("t", streams=said(force=3)), Provenance())
     found = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
     assert found == ["streams/force/t runs backwards"]

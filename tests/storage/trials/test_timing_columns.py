@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sliplab.storage.schema.trial import Provenance
-from sliplab.storage.streams import ClockReads, PulseChunk
+from sliplab.storage.streams import ClockReads, ExposureChunk, PulseChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import TIMING
 from sliplab.storage.trials.store import Store
@@ -43,9 +43,9 @@ def write(writer: TrialWriter, pieces: int) -> Path:
     for chunk in (BOX, CAMERA):
         for rows in np.array_split(np.arange(len(chunk)), pieces):
             part = cut(chunk, slice(int(rows[0]), int(rows[-1]) + 1))
-            (writer.add_box_reads if chunk is BOX else writer.add_frame_camera_reads)(part)
+            writer.add("sync_box" if chunk is BOX else "frames", part)
     for part in np.array_split(EXPOSURES.t_ns, pieces):
-        writer.add_exposures(PulseChunk(part))
+        writer.add("sync_box", ExposureChunk(part))
     return writer.commit(record("t"), Provenance())
 
 
@@ -78,9 +78,9 @@ def test_nothing_is_made_where_nothing_comes(tmp_path: Path) -> None:
     for name in ("plain", "empty"):
         writer = where.begin(name, FRAME, 100)
         if name == "empty":
-            writer.add_exposures(PulseChunk(EMPTY))
-            writer.add_box_reads(ClockReads(EMPTY, EMPTY, EMPTY))
-            writer.add_frame_camera_reads(ClockReads(EMPTY, EMPTY, EMPTY))
+            writer.add("sync_box", ExposureChunk(EMPTY))
+            writer.add("sync_box", ClockReads(EMPTY, EMPTY, EMPTY))
+            writer.add("frames", ClockReads(EMPTY, EMPTY, EMPTY))
         fill(writer)
         data.append(writer.commit(record(name), Provenance()) / "data.h5")
     assert data[0].read_bytes() == data[1].read_bytes()
@@ -96,8 +96,8 @@ def test_nothing_is_made_where_nothing_comes(tmp_path: Path) -> None:
 def test_verify_sees_a_clock_that_was_read_backwards(tmp_path: Path) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     fill(writer)
-    writer.add_box_reads(cut(BOX, slice(0, 2)))
-    writer.add_box_reads(cut(BOX, slice(0, 1)))
+    writer.add("sync_box", cut(BOX, slice(0, 2)))
+    writer.add("sync_box", cut(BOX, slice(0, 1)))
     writer.commit(record("t"), Provenance())
     said = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
     assert said == [f"box_reads/{name} runs backwards" for name in ("t", "before", "after")]

@@ -38,9 +38,9 @@ def tracks(count: int, plate: bool, start: int = 0, seed: int = 0) -> FrameChunk
 def take(where: Campaign, trial: str, chunks: list[FrameChunk], *, spool: bool = False) -> Path:
     """A committed trial whose frames are these."""
     writer = where.begin(trial, FRAME, 100, spool=spool)
-    writer.add_frames(chunks[0])
+    writer.add("frames", chunks[0])
     for chunk in chunks[1:]:
-        writer.add_frames(chunk)
+        writer.add("frames", chunk)
     fill(writer, with_frames=False)
     frames = sum(map(len, chunks))
     counts = {"events": 1000, "frames": frames, "poses": 10, "pulses": 10}

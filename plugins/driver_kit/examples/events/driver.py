@@ -63,7 +63,7 @@ class ExampleEvents:
 
     def read(self) -> EventChunk:
         """Events since the last call. Raises RigError: it is gone or silent."""
-        return EventChunk.joined(self._buffer.take("events"))
+        return EventChunk.concatenate(self._buffer.take("events"))
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns. Raises RigError as `read`."""

@@ -62,7 +62,7 @@ def all_of(
     until(done)
     chunks.append(camera.read())
     pulses.append(camera.read_pulses().t_ns)
-    return EventChunk.joined(chunks), np.concatenate(pulses), sent
+    return EventChunk.concatenate(chunks), np.concatenate(pulses), sent
 
 
 def test_nothing_is_lost_and_all_is_exact(until: Until) -> None:

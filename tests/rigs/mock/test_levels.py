@@ -7,7 +7,13 @@ import pytest
 
 from sliplab import protocols
 from sliplab.protocols.plan import Plan, load_plan
-from sliplab.rigs.levels import choose_level, expected_onsets, slides_of, slip_expected, with_level
+from sliplab.rigs.mock.levels import (
+    choose_level,
+    expected_onsets,
+    slides_of,
+    slip_expected,
+    with_level,
+)
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.scene.onsets import Material
 

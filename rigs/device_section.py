@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
+from pydantic import BaseModel, Field, GetJsonSchemaHandler, TypeAdapter
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
+from pydantic_core import CoreSchema, core_schema
 
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError, register_tags_of
+from sliplab.protocols.plan import Plan
+from sliplab.protocols.program import Twist
 from sliplab.protocols.yaml_file import ChosenModel, StrictModel
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings, GripperSettings
@@ -24,9 +27,12 @@ from sliplab.rigs.core.driver import (
     ForceSensorDriver,
     FrameCameraDriver,
     GripperDriver,
+    RigDriver,
     SyncBoxDriver,
 )
+from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.core.registry import DriverError, drivers, find_driver
+from sliplab.rigs.core.sections import RigSection
 
 register_tags_of("source", "usb", "network")
 
@@ -48,18 +54,13 @@ class OfKind(ChosenModel):
     def __init__(self, kind: type[Driver[Any]], default: str | None = None) -> None:
         self._kind, self._default = kind, default
 
-    def read(self, value: Any) -> DriverSettings:
-        """Return the settings in `value`, checked by the driver that it names."""
-        if isinstance(value, DriverSettings):
-            return value
-        if not isinstance(value, dict):
-            raise ValueError("must be a mapping (key: value)")
+    def choose(self, value: dict[str, Any]) -> type[BaseModel]:
+        """Return the settings of the driver that `value` names."""
         name = value.get("driver", self._default)
         try:
-            driver = find_driver(str(name), self._kind)
+            return find_driver(str(name), self._kind).settings
         except DriverError as error:
             raise KeyedError(".driver", name, str(error)) from None
-        return self.checked(driver.settings, value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
@@ -74,6 +75,24 @@ class OfKind(ChosenModel):
         return handler(TypeAdapter(choice).core_schema)
 
 
+class Simulated(ChosenModel):
+    """Settings of the simulated rig, or of a further device of it."""
+
+    def __init__(self, stream: str | None = None) -> None:
+        self._stream = stream
+
+    def choose(self, value: dict[str, Any]) -> type[BaseModel]:
+        """Return the settings as the driver `mock` declares them."""
+        mock = find_driver("mock", RigDriver)
+        return mock.settings if self._stream is None else mock.streams[self._stream]
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        models = core_schema.list_schema(self.choose({}).__pydantic_core_schema__)
+        return {"allOf": [handler(models)["items"]]}  # a reference, instead of the whole model
+
+
 class OperatedPlate(StrictModel):
     """A plate on a slider that the operator raises, releases and catches on request."""
 
@@ -82,7 +101,7 @@ class OperatedPlate(StrictModel):
     """Mass mounted when the session begins, kg; a changeover requests another one."""
 
 
-class DeviceSettings(StrictModel):
+class DeviceSettings(RigSection):
     """The `devices:` section of a rig file."""
 
     arm: Annotated[BaseArmSettings, OfKind(ArmDriver)]
@@ -142,3 +161,35 @@ class DeviceSettings(StrictModel):
     def gripper_driver(self) -> GripperDriver[Any] | None:
         """The driver of the gripper, if the rig has one."""
         return None if self.gripper is None else find_driver(self.gripper.driver, GripperDriver)
+
+    @property
+    def has_force(self) -> bool:
+        """True if there is a force sensor."""
+        return self.force_sensor is not None
+
+    @property
+    def gripper_range(self) -> GripperRange | None:
+        """Values that the gripper's commands may have; None without a gripper."""
+        driver = self.gripper_driver
+        return None if driver is None else driver.range(self.gripper)
+
+    @property
+    def grip_opening_mm(self) -> float | None:
+        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
+        return None if self.gripper is None else self.gripper.opening_mm
+
+    def plan_faults(self, plan: Plan, file: str) -> Iterator[InputError]:
+        """Check that the arm can twist, if the plan does."""
+        driver = self.arm_driver
+        if driver.twists:
+            return
+        for trial in plan:
+            if any(isinstance(step, Twist) for step in plan.program(trial).steps):
+                yield InputError(
+                    file,
+                    "devices.arm.driver",
+                    driver.name,
+                    f"cannot turn the tool evenly on the spot, and trial {trial.id} of {plan.file} "
+                    "does; use another driver, such as 'abb'",
+                )
+                return

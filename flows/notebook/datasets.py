@@ -1,0 +1,119 @@
+"""A store's windows as data sets of other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.windows.dataset import cut_windows
+from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.windows import Windows
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+I64 = npt.NDArray[np.int64]
+
+
+def labelled(windows: pd.DataFrame) -> pd.DataFrame:
+    """Return the windows that have a class, numbered anew."""
+    return windows[windows["label"].notna()].reset_index(drop=True)
+
+
+def classes_of(windows: pd.DataFrame) -> I64:
+    """Return the class of each window, (n,); -1 where it has none."""
+    number = {name: k for k, name in enumerate(CLASSES)}
+    return windows["label"].map(number).fillna(-1).to_numpy(np.int64)
+
+
+def _by_trial(store: Store, windows: pd.DataFrame) -> dict[tuple[str, str], tuple[Recording, I64]]:
+    """Return each trial's recording, and its rows in `windows`.
+
+    Raises:
+        InputError: a column is missing. StoreError: there is no such trial.
+    """
+    for name in ("campaign", "trial", "start_ns"):
+        if name not in windows.columns:
+            raise InputError("windows", name, None, "is missing; `Store.windows` makes the table")
+    groups = windows.groupby(["campaign", "trial"], sort=False).indices
+    return {
+        (campaign, trial): (store.campaign(campaign).recording(trial), np.asarray(rows))
+        for (campaign, trial), rows in groups.items()
+    }
+
+
+def event_counts(store: Store, windows: pd.DataFrame, shape: Windows) -> SparseWindows:
+    """Return the event counts of windows, in the table's order.
+
+    Args:
+        shape: crop, cells, steps and length of a window.
+    """
+    parts, places = [], [np.empty(0, np.int64)]
+    for recording, rows in _by_trial(store, windows).values():
+        starts = windows["start_ns"].to_numpy(np.int64)[rows]
+        order = np.argsort(starts, kind="stable")
+        parts.append(cut_windows(recording, starts[order], shape))
+        places.append(rows[order])
+    whole = SparseWindows.join(parts, (shape.steps, shape.channels, shape.cells, shape.cells))
+    return whole.take(np.argsort(np.concatenate(places), kind="stable"))
+
+
+class EventDataset:
+    """The events of windows, as tonic's data sets give them: ``(events, class)``.
+
+    Events are a structured array of ``x``, ``y``, ``t`` (microseconds from the window's start) and
+    ``p``; the class is -1 where a window has none.
+
+    Attributes:
+        windows: the table, a row for each item.
+        sensor_size: columns, rows, polarities. ordering: names of the fields of an event.
+        classes: names of the classes.
+    """
+
+    dtype = np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", np.int8)])
+    ordering = ("x", "y", "t", "p")
+    classes = CLASSES
+
+    def __init__(
+        self,
+        store: Store,
+        windows: pd.DataFrame,
+        length_ns: int,
+        transform: Callable[[Any], Any] | None = None,
+        target_transform: Callable[[Any], Any] | None = None,
+    ) -> None:
+        self.windows, self._length_ns = windows, length_ns
+        self.transform, self.target_transform = transform, target_transform
+        trials = _by_trial(store, windows)
+        self._recordings = {key: recording for key, (recording, _) in trials.items()}
+        sizes = {recording.event_px for recording in self._recordings.values()}
+        if len(sizes) > 1:
+            text = "must be of one camera; theirs have " + ", ".join(map(str, sorted(sizes)))
+            raise InputError("windows", "", None, text)
+        self.sensor_size = (*(sizes.pop() if sizes else (0, 0)), 2)
+        self._targets = classes_of(windows)
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: int) -> tuple[Any, Any]:
+        row = self.windows.iloc[index]
+        recording = self._recordings[row["campaign"], row["trial"]]
+        start = int(row["start_ns"])
+        found = recording.events(start, start + self._length_ns)
+        times = np.asarray(recording.clock("events").to_reference(found.t_us * 1000))
+        events = np.empty(len(found.t_us), self.dtype)
+        events["x"], events["y"], events["p"] = found.x, found.y, found.p
+        events["t"] = (times - start) // 1000
+        target: Any = int(self._targets[index])
+        return (
+            events if self.transform is None else self.transform(events),
+            target if self.target_transform is None else self.target_transform(target),
+        )

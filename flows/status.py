@@ -1,0 +1,342 @@
+"""The state of a store: who collects, how far each campaign is, when it ends, what needs a person.
+
+Nights are counted from noon to noon, local time, by the end of each committed trial. How many more
+are needed follows from the trials of the nights so far; the current night is left out while there
+are others, as it is not over.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, date, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from statistics import mean, median, stdev
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.references import last_drift
+from sliplab.flows.planning.campaign_trials import ExcludedTrial, excluded_trials
+from sliplab.flows.planning.disk_space import RESERVE
+from sliplab.protocols import InputError, Plan
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
+from sliplab.storage.process import named
+from sliplab.storage.streams import Json
+from sliplab.storage.trials import control
+from sliplab.storage.trials.checksums import PROVENANCE, incomplete
+from sliplab.storage.trials.lock import STORE_LOCK, current_holder
+from sliplab.storage.trials.store import IMPORTED, Campaign, Store
+
+LOOK_BACK = 50
+"""Committed trials from which pace and size are estimated."""
+CONFIDENCE = 0.9
+"""Of the interval of the nights that are left."""
+FEWEST = 4
+"""Nights from which an interval is given."""
+_MOST_TIMES = 20
+"""Times the expected nights up to which an upper bound is looked for."""
+LONGEST_GAP = 3.0
+"""Times its planned seconds: where a trial ended later after the one before, something else came
+between, such as a person, and the pair says nothing about the pace."""
+
+
+@dataclass(frozen=True)
+class NightsLeft:
+    """Nights that the missing trials need.
+
+    Attributes:
+        expected: by the mean of the nights so far.
+        low, high: 90 % interval; None with fewer than `FEWEST` nights, which do not show how much
+            nights differ. `high` is None, too, where nights differ so much that nothing bounds it.
+        first, last: dates of the last night by `low` and `high`, or by `expected` without them.
+    """
+
+    expected: int
+    low: int | None
+    high: int | None
+    first: str
+    last: str
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Change of a figure of the reference trials since the first one.
+
+    Attributes:
+        key: of the protocol's ``gates.reference``.
+        percent: change; bound_percent: largest that the protocol allows.
+    """
+
+    key: str
+    percent: float
+    bound_percent: float
+    trial: str
+
+
+@dataclass(frozen=True)
+class CampaignStatus:
+    """State of one campaign.
+
+    Attributes:
+        planned, committed, missing: numbers of trials; missing ones are still to be taken.
+        excluded: trials that no collection takes, with their causes.
+        last_ended: when the last committed trial ended, UTC.
+        nights: nights on which trials were committed; tonight: trials of the current one.
+        seconds_left: at the rig, by the planned times and the pace so far; None without a trial.
+        nights_left: None while nothing is known, or nothing is missing.
+        bytes_per_trial: median on disk; None without a trial.
+        nights_of_disk: nights until the disk is full, at the pace so far.
+        drift: of the last reference trial.
+        problem: why the campaign could not be read; all else is empty then.
+    """
+
+    campaign: str
+    simulated: bool
+    planned: int = 0
+    committed: int = 0
+    missing: int = 0
+    excluded: list[ExcludedTrial] = field(default_factory=list)
+    last_ended: str | None = None
+    nights: int = 0
+    tonight: int = 0
+    seconds_left: float | None = None
+    nights_left: NightsLeft | None = None
+    bytes_per_trial: int | None = None
+    nights_of_disk: float | None = None
+    drift: list[Drift] = field(default_factory=list)
+    problem: str | None = None
+
+
+@dataclass(frozen=True)
+class StoreStatus:
+    """State of a store.
+
+    Attributes:
+        running: the program that holds the store, in words; None if none does.
+        since: when it took the store, UTC.
+        collects: name of the campaign that it takes trials for; None if it takes none.
+        paused: who paused the store, when and why, in words; None if it is not paused.
+        disk_free: bytes, without the reserve that a collection keeps.
+        imported: campaigns that were imported, and have no plan.
+    """
+
+    store: str
+    running: str | None
+    since: str | None
+    collects: str | None
+    paused: str | None
+    disk_free: int
+    campaigns: list[CampaignStatus]
+    imported: list[str]
+
+
+@dataclass(frozen=True)
+class _TrialFolder:
+    """When a committed trial ended, if that is known, and its bytes on disk."""
+
+    ended: datetime | None
+    bytes: int
+
+
+class StatusReader:
+    """Reads the state of a store again and again; what cannot change is read once."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._known: dict[tuple[Path, int], _TrialFolder] = {}
+        self._drift: dict[tuple[str, ...], list[Drift]] = {}
+        self._plans: dict[tuple[Path, int], Plan] = {}
+
+    def read(self, now: datetime | None = None) -> StoreStatus:
+        """Return the state.
+
+        Args:
+            now: local time with its zone; the clock's by default.
+
+        Raises:
+            StoreError: the store is damaged.
+        """
+        now = now or datetime.now().astimezone()
+        holder = current_holder(self._store.folder / STORE_LOCK)
+        paused = control.paused(self._store)
+        free = max(shutil.disk_usage(self._store.folder).free - RESERVE, 0)
+        campaigns, imported = [], []
+        for campaign in self._store.campaigns():
+            if IMPORTED in campaign.info:
+                imported.append(campaign.name)
+                continue
+            campaigns.append(self._campaign(campaign, free, now))
+        return StoreStatus(
+            store=str(self._store.folder),
+            running=None if holder is None else named(holder),
+            since=None if holder is None else holder.get("since"),
+            collects=None if holder is None else holder.get("collects") or None,
+            paused=None if paused is None else str(paused),
+            disk_free=free,
+            campaigns=campaigns,
+            imported=imported,
+        )
+
+    def _campaign(self, campaign: Campaign, free: int, now: datetime) -> CampaignStatus:
+        simulated = bool(campaign.info["simulated"])
+        try:
+            plan = self._plan(campaign)
+            folders = self._folders(campaign)
+            committed = set(folders)
+            excluded = excluded_trials(plan, campaign, committed)
+            done = [trial for trial in plan if trial.id in committed]
+            out = {item["trial"] for item in excluded}
+            missing = [t for t in plan if t.id not in committed and t.id not in out]
+            ended = {
+                trial.id: moment.astimezone(now.tzinfo)
+                for trial in done
+                if (moment := folders[trial.id].ended) is not None
+            }
+            by_night = Counter(night_of(moment) for moment in ended.values())
+            tonight = by_night.get(night_of(now), 0)
+            nights = [by_night[night] for night in sorted(by_night)]
+            over = nights[:-1] if tonight and len(nights) > 1 else nights
+            sizes = [folders[trial.id].bytes for trial in done[-LOOK_BACK:]]
+            size = round(median(sizes)) if sizes else None
+            pace = pace_of(plan, ended)
+            left = sum(plan.seconds(trial) for trial in missing)
+            a_night = mean(over) if over else 0.0
+            return CampaignStatus(
+                campaign=campaign.name,
+                simulated=simulated,
+                planned=len(plan),
+                committed=len(done),
+                missing=len(missing),
+                excluded=excluded,
+                last_ended=_utc(max(ended.values())) if ended else None,
+                nights=len(nights),
+                tonight=tonight,
+                seconds_left=left * pace if missing and pace is not None else None,
+                nights_left=_nights_left(by_night, over, len(missing), now),
+                bytes_per_trial=size,
+                nights_of_disk=free / (size * a_night) if size and a_night else None,
+                drift=self._drifts(plan, campaign, committed),
+            )
+        except (InputError, StoreError) as error:
+            return CampaignStatus(campaign.name, simulated, problem=str(error))
+
+    def _plan(self, campaign: Campaign) -> Plan:
+        try:
+            key = campaign.protocol_file, campaign.protocol_file.stat().st_mtime_ns
+        except OSError as error:
+            raise StoreError(str(error)) from None
+        if key not in self._plans:
+            self._plans[key] = Collected(campaign).plan
+        return self._plans[key]
+
+    def _folders(self, campaign: Campaign) -> dict[str, _TrialFolder]:
+        """Return the complete trials by id; each folder is read once, as it never changes."""
+        found = {}
+        for path in campaign.folders("trials"):
+            key = path, path.stat().st_ino  # a trial that is taken again is another folder
+            if key not in self._known and incomplete(path) is None:
+                size = sum(each.stat().st_size for each in path.iterdir() if each.is_file())
+                self._known[key] = _TrialFolder(_moment(path / PROVENANCE), size)
+            if key in self._known:
+                found[path.name] = self._known[key]
+        return found
+
+    def _drifts(self, plan: Plan, campaign: Campaign, committed: set[str]) -> list[Drift]:
+        known = [t.id for t in plan if t.role == "reference" and t.id in committed]
+        key = (campaign.name, *known[:1], *known[-1:])
+        if key not in self._drift:
+            self._drift[key] = [
+                Drift(item.key, item.percent, item.bound_percent, item.trial)
+                for item in last_drift(plan, campaign, committed)
+            ]
+        return self._drift[key]
+
+
+def night_of(moment: datetime) -> date:
+    """Return the date on whose evening the night of a local time began: noon to noon."""
+    return (moment - timedelta(hours=12)).date()
+
+
+def pace_of(plan: Plan, ended: dict[str, datetime]) -> float | None:
+    """Return the seconds that a planned second takes, median of the last trials.
+
+    Args:
+        ended: when trials ended, by id.
+
+    Returns:
+        None with fewer than two trials in a row.
+    """
+    planned = {trial.id: plan.seconds(trial) for trial in plan if trial.id in ended}
+    order = sorted(ended, key=lambda trial: (ended[trial], trial))
+    paces = []
+    for before, trial in pairwise(order):
+        took = (ended[trial] - ended[before]).total_seconds()
+        if planned[trial] > 0 and 0 <= took <= LONGEST_GAP * planned[trial] + 60:
+            paces.append(took / planned[trial])
+    return median(paces[-LOOK_BACK:]) if paces else None
+
+
+def nights_needed(trials: Sequence[int], missing: int) -> tuple[int, int | None, int | None]:
+    """Return how many nights the missing trials need, and a 90 % interval.
+
+    The sum of N further nights has mean N m and variance N s^2 + N^2 s^2 / k, where m and s are the
+    mean and standard deviation of the k nights so far; its bounds are those of Student's t with
+    k - 1 degrees of freedom. Nights are taken as independent.
+
+    Args:
+        trials: of each night so far, at least one night, not all of them 0.
+        missing: trials that are left.
+    """
+    m = mean(trials)
+    expected = math.ceil(missing / m)
+    if len(trials) < FEWEST:
+        return expected, None, None
+    from scipy.special import stdtrit
+
+    k, s = len(trials), stdev(trials)
+    t = float(stdtrit(k - 1, (1 + CONFIDENCE) / 2))
+
+    def nights(sign: int) -> int | None:
+        for n in range(1, _MOST_TIMES * expected + 1):
+            if n * m + sign * t * s * math.sqrt(n + n * n / k) >= missing:
+                return n
+        return None
+
+    return expected, nights(+1), nights(-1)
+
+
+def _nights_left(
+    by_night: Counter[date], over: Sequence[int], missing: int, now: datetime
+) -> NightsLeft | None:
+    """Return the nights that are left and their dates, at the share of nights used so far."""
+    if not missing or not over:
+        return None
+    expected, low, high = nights_needed(over, missing)
+    days = (max(by_night) - min(by_night)).days + 1
+    each = days / len(by_night)  # days a night: weekends and other work come between
+    tonight = night_of(now)
+
+    def ends(nights: int) -> str:
+        return (tonight + timedelta(days=math.ceil(nights * each) - 1)).isoformat()
+
+    return NightsLeft(expected, low, high, ends(low or expected), ends(high or expected))
+
+
+def _moment(path: Path) -> datetime | None:
+    try:
+        return datetime.fromisoformat(str(read_json(path)["ended"]))
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _utc(moment: datetime) -> str:
+    return moment.astimezone(UTC).isoformat(timespec="seconds")
+
+
+def as_json(status: StoreStatus) -> Json:
+    """Return the state as one JSON object."""
+    return asdict(status)

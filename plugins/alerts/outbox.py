@@ -1,0 +1,155 @@
+"""Messages on their way, as files of the store: none is lost when a receiver or we are down.
+
+    STORE/alerts/began.json      when alerts began: what is older is not told
+    STORE/alerts/KEY.json        an event, and to whom it was sent when
+
+An event is written before it is sent, under a name made of its key: it is told once, however often
+it is found. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
+the others are not affected.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Protocol
+
+from sliplab.plugins.alerts.conditions import Event
+from sliplab.storage.files import inside, make_folder, read_json, write_json, write_new_json
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
+
+FOLDER, BEGAN = "alerts", "began.json"
+EVER = datetime.min.replace(tzinfo=UTC)
+FIRST_RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
+
+
+class Target(Protocol):
+    """Sends to one address."""
+
+    name: str
+    """The address without its secrets."""
+
+    def send(self, title: str, text: str) -> bool:
+        """Return whether the message was taken."""
+
+
+@dataclass
+class _Line:
+    """A target, and when it is tried next."""
+
+    target: Target
+    key: str
+    failures: int = 0
+    next_try: datetime = EVER
+    sent: list[datetime] = field(default_factory=list)
+    """Of the last hour."""
+
+
+class Outbox:
+    """The messages of one store.
+
+    Args:
+        most_per_hour: to each target; further ones wait and are sent as one.
+        say: prints a line for the person at the terminal.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        targets: Sequence[Target],
+        most_per_hour: int,
+        now: datetime,
+        say: Callable[[str], None],
+    ) -> None:
+        self._folder = inside(store.folder / FOLDER, store.folder)
+        make_folder(self._folder)
+        write_new_json(self._folder / BEGAN, {"began": _utc(now)})
+        self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
+        self._lines = [_Line(target, _digest(target.name)) for target in targets]
+        self._most, self._say = most_per_hour, say
+        self._waiting = {path: read_json(path) for path in self._files()}
+        self._known = set(self._waiting)
+
+    def add(self, event: Event, urgent: bool) -> bool:
+        """Keep an event to be sent; False if it is known, or older than the alerts."""
+        path = self._folder / f"{_digest(event.key)}.json"
+        if path in self._known or event.since < self.began:
+            return False
+        data: Json = {
+            "key": event.key,
+            "kind": event.kind,
+            "text": event.text,
+            "when": _utc(event.since),
+            "urgent": urgent,
+            "sent": {},
+        }
+        self._known.add(path)
+        if not write_new_json(path, data):
+            return False
+        self._waiting[path] = data
+        return True
+
+    def send(self, title: str, now: datetime, *, quiet: bool = False) -> int:
+        """Send what waits, to each target that is due; return the number of messages taken.
+
+        Args:
+            quiet: only urgent ones.
+        """
+        due = [line for line in self._lines if line.next_try <= now]
+        work = []
+        for line in due:
+            line.sent = [moment for moment in line.sent if now - moment < timedelta(hours=1)]
+            if len(line.sent) >= self._most:
+                continue
+            events = {
+                path: data
+                for path, data in sorted(self._waiting.items(), key=lambda pair: pair[1]["when"])
+                if line.key not in data["sent"] and (data["urgent"] or not quiet)
+            }
+            if events:
+                work.append((line, events))
+        if not work:
+            return 0
+        with ThreadPoolExecutor(len(work)) as pool:  # a slow target delays no other
+            taken = list(
+                pool.map(lambda each: each[0].target.send(title, _text(each[1].values())), work)
+            )
+        for (line, events), well in zip(work, taken, strict=True):
+            self._note(line, list(events), well, now)
+        return sum(taken)
+
+    def _note(self, line: _Line, events: list[Path], well: bool, now: datetime) -> None:
+        if not well:
+            wait = min(FIRST_RETRY_S * 2**line.failures, LONGEST_RETRY_S)
+            line.failures += 1
+            line.next_try = now + timedelta(seconds=wait)
+            self._say(f"{line.target.name} did not take a message; tried again in {wait:.0f} s")
+            return
+        line.failures, line.next_try = 0, now
+        line.sent.append(now)
+        for path in events:
+            data = self._waiting[path]
+            data["sent"][line.key] = _utc(now)
+            write_json(path, data)
+            if all(each.key in data["sent"] for each in self._lines):
+                del self._waiting[path]
+
+    def _files(self) -> list[Path]:
+        return sorted(path for path in self._folder.glob("*.json") if path.name != BEGAN)
+
+
+def _text(events: Iterable[Json]) -> str:
+    return "\n".join(str(data["text"]) for data in events)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def _utc(moment: datetime) -> str:
+    return moment.astimezone(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,339 @@
+"""Alerts: each kind once, none lost while a receiver is down, none before it may be sent."""
+
+from __future__ import annotations
+
+import json
+import socketserver
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+import yaml
+
+from sliplab.flows.running import run_records
+from sliplab.flows.status import CampaignStatus, Drift, NightsLeft, StoreStatus
+from sliplab.plugins.alerts.conditions import Event, events
+from sliplab.plugins.alerts.outbox import Outbox
+from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
+from sliplab.plugins.alerts.watcher import AlertWatcher, AppriseTarget
+from sliplab.protocols import InputError
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.trials import control
+from sliplab.storage.trials.checksums import RECORD
+from sliplab.storage.trials.store import Store
+from tests.command_line import here
+from tests.storage.trial_files import campaign, commit, fail
+
+NOW = datetime(2030, 3, 2, 22, 0, tzinfo=UTC)
+
+
+class Receiver:
+    """Takes messages, or does not."""
+
+    def __init__(self, name: str = "json://here", up: bool = True) -> None:
+        self.name, self.up = name, up
+        self.taken: list[str] = []
+        self.tried = 0
+
+    def send(self, title: str, text: str) -> bool:
+        self.tried += 1
+        if self.up:
+            self.taken.append(text)
+        return self.up
+
+
+def settings(**changes: Any) -> AlertSettings:
+    return AlertSettings.model_validate({"to": ["json://localhost"], **changes})
+
+
+def state(**changes: Any) -> StoreStatus:
+    one = StoreStatus(
+        store="s",
+        running=None,
+        since=None,
+        collects=None,
+        paused=None,
+        disk_free=10**9,
+        campaigns=[],
+        imported=[],
+    )
+    return replace(one, **changes)
+
+
+def found(store: Store, at: StoreStatus, now: datetime = NOW, **changes: Any) -> list[Event]:
+    return list(events(store, at, settings(**changes), now))
+
+
+def watcher(
+    store: Store, receivers: list[Receiver], now: datetime = NOW, **changes: Any
+) -> tuple[AlertWatcher, list[str]]:
+    pinged: list[str] = []
+    made = AlertWatcher(
+        store, settings(**changes), list(receivers), now, lambda text: None, pinged.append
+    )
+    return made, pinged
+
+
+RUNNING = CampaignStatus(
+    "tiny",
+    True,
+    planned=10,
+    committed=4,
+    missing=6,
+    last_ended="2030-03-02T20:00:00+00:00",
+    bytes_per_trial=10**9,
+    nights_of_disk=1.0,
+    nights_left=NightsLeft(2, None, None, "2030-03-03", "2030-03-03"),
+    drift=[Drift("event_rate", -17.0, 20.0, "r2")],
+)
+
+
+def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
+    tiny = campaign(tmp_path / "s", "tiny")
+    store = Store.open(tmp_path / "s")
+    run = str(uuid4())
+    run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
+    run_records.end(store.folder, run, "FAILED", "the arm did not answer", "flow")
+    control.ask(store, "pause", who="anna", why="lunch")
+    for attempt in (1, 2):
+        fail(tiny, "b", attempt)
+    for number, grade in enumerate(("digital input", "host time")):
+        folder = commit(tiny, f"t{number}")
+        record = read_json(folder / RECORD)
+        record["clocks"]["arm"]["grade"] = grade
+        write_json(folder / RECORD, record)
+    at = state(campaigns=[RUNNING], collects="tiny", since="2030-03-02T19:00:00+00:00")
+    done = state(campaigns=[replace(RUNNING, missing=0, planned=4, nights_of_disk=None)])
+    texts = {item.kind: item.text for item in [*found(store, at), *found(store, done)]}
+    assert set(texts) == set(KINDS)
+    assert texts["run failed"] == "nightly failed: the arm did not answer"
+    assert "pause by anna" in texts["paused"]
+    assert texts["drift"].startswith("tiny (simulated): event_rate of the reference trial r2")
+    assert "no trial for 120 min" in texts["idle"]
+    assert "from digital input to host time with trial t1" in texts["clock grade"]
+    assert "b failed 2 times" in texts["trial set aside"]
+    assert texts["campaign done"] == "tiny (simulated): done, 4 of 4 trials"
+    few = found(store, at, about=["disk"])
+    assert [item.kind for item in few] == ["disk"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "at"),
+    [
+        ({"idle_min": 121}, state(campaigns=[RUNNING], collects="tiny", since="2030-03-02T19:00Z")),
+        ({}, state(campaigns=[RUNNING], collects="tiny", since="2030-03-02T21:30Z")),
+        ({}, state(campaigns=[RUNNING], collects="tiny", since="2030-03-02T19:00Z", paused="x")),
+        ({}, state(campaigns=[RUNNING])),
+    ],
+    ids=["shorter than set", "begun since", "paused", "nothing collects"],
+)
+def test_a_wait_that_is_expected_is_not_idle(
+    tmp_path: Path, changes: dict[str, Any], at: StoreStatus
+) -> None:
+    store = Store.create(tmp_path / "s")
+    assert "idle" not in {item.kind for item in found(store, at, **changes)}
+
+
+def test_a_drift_that_is_no_number_is_told(tmp_path: Path) -> None:
+    lost = replace(RUNNING, drift=[Drift("friction", float("nan"), 10.0, "r2")])
+    kinds = {item.kind for item in found(Store.create(tmp_path / "s"), state(campaigns=[lost]))}
+    assert "drift" in kinds
+
+
+def test_nothing_is_lost_while_a_receiver_is_down_and_nothing_is_told_twice(
+    tmp_path: Path,
+) -> None:
+    store = Store.create(tmp_path / "s")
+    up, down = Receiver("json://a"), Receiver("json://b", up=False)
+    watching, _ = watcher(store, [up, down])
+    run = str(uuid4())
+    run_records.begin(store.folder, run, "collect", run_records.EMBEDDED)
+    write_json(
+        store.folder / "control" / "runs" / f"{run}.end.json",
+        {"state": "CRASHED", "message": "killed", "when": NOW.isoformat(), "by": "flow"},
+    )
+    for second in range(0, 300, 3):
+        watching.look(NOW + timedelta(seconds=second))
+    assert up.taken == ["collect crashed: killed"]
+    assert down.taken == []
+    assert 5 <= down.tried <= 8  # ever less often
+    down.up = True
+    again, _ = watcher(store, [up, down])  # the program began anew in the meantime
+    for second in range(300, 900, 3):
+        again.look(NOW + timedelta(seconds=second))
+    assert up.taken == down.taken == ["collect crashed: killed"]
+
+
+def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "s")
+    receiver = Receiver()
+    box = Outbox(store, [receiver], 30, NOW, lambda text: None)
+    assert not box.add(Event("a", "paused", "old", NOW - timedelta(seconds=1)), urgent=True)
+    assert box.add(Event("b", "paused", "new", NOW), urgent=True)
+    assert not box.add(Event("b", "paused", "new", NOW), urgent=True)
+    assert box.send("t", NOW) == 1
+    assert receiver.taken == ["new"]
+
+
+def test_quiet_hours_hold_all_but_urgent_messages(tmp_path: Path) -> None:
+    quiet = settings(quiet={"from": "22:00", "until": "07:00"}, timezone="Europe/Rome")
+    assert quiet.is_quiet(NOW)
+    assert quiet.is_quiet(datetime(2030, 3, 2, 21, 0, tzinfo=UTC))
+    assert not quiet.is_quiet(datetime(2030, 3, 2, 20, 59, tzinfo=UTC))
+    assert not quiet.is_quiet(datetime(2030, 3, 3, 6, 0, tzinfo=UTC))
+    receiver = Receiver()
+    box = Outbox(Store.create(tmp_path / "s"), [receiver], 30, NOW, lambda text: None)
+    box.add(Event("a", "paused", "later", NOW), urgent=False)
+    box.add(Event("b", "disk", "at once", NOW), urgent=True)
+    box.send("t", NOW, quiet=True)
+    assert receiver.taken == ["at once"]
+    box.send("t", NOW + timedelta(hours=9))
+    assert receiver.taken == ["at once", "later"]
+
+
+def test_a_flood_becomes_one_message(tmp_path: Path) -> None:
+    receiver = Receiver()
+    box = Outbox(Store.create(tmp_path / "s"), [receiver], 3, NOW, lambda text: None)
+    for number in range(50):
+        now = NOW + timedelta(minutes=number)
+        box.add(Event(str(number), "trial set aside", f"trial {number}", now), urgent=False)
+        box.send("t", now)
+    assert [text.count("\n") + 1 for text in receiver.taken] == [1, 1, 1]
+    box.send("t", NOW + timedelta(minutes=61))
+    assert receiver.taken[-1].count("\n") + 1 == 47
+
+
+def test_a_summary_is_sent_once_a_day_and_a_ping_after_each_trial_and_hour(tmp_path: Path) -> None:
+    tiny = campaign(tmp_path / "s", "tiny")
+    store, receiver = Store.open(tmp_path / "s"), Receiver()
+    watching, pinged = watcher(store, [receiver], summary="22:00", ping="http://localhost/x")
+    for minute in range(0, 50, 10):
+        watching.look(NOW + timedelta(minutes=minute))
+    assert len(receiver.taken) == 1
+    assert "nothing runs" in receiver.taken[0]
+    assert len(pinged) == 1
+    watching.look(NOW + timedelta(minutes=61))
+    assert len(pinged) == 2
+    commit(tiny, "a")
+    watching.look(NOW + timedelta(minutes=62))
+    assert len(pinged) == 2  # its campaign has no plan here: nothing is expected of it
+
+
+def write(folder: Path, **changes: Any) -> Path:
+    path = folder / "alerts.yaml"
+    path.write_text(yaml.safe_dump({"alerts": {"to": ["json://localhost"], **changes}}))
+    return path
+
+
+def test_a_file_names_all_its_faults_and_quotes_no_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LAB_CHAT", raising=False)
+    wrong = write(tmp_path, about=["pause"], summary="7:30", timezone="Mars", attempts=0)
+    with pytest.raises(InputError) as error:
+        load_alerts(wrong)
+    for key in ("about[0]", "summary", "timezone", "attempts"):
+        assert f"alerts.{key}" in str(error.value)
+    to = ["${LAB_CHAT}", "nonsense-hunter2", "json://a"]
+    with pytest.raises(InputError) as error:
+        load_alerts(write(tmp_path, to=to, ping="ftp://hunter2"))
+    text = str(error.value)
+    assert "alerts.to[0]" in text
+    assert "LAB_CHAT is not set" in text
+    assert "alerts.to[1]" in text
+    assert "alerts.ping" in text
+    assert "hunter2" not in text
+
+
+def test_a_file_of_schedules_may_hold_the_alerts(tmp_path: Path) -> None:
+    path = tmp_path / "schedules.yaml"
+    path.write_text("timezone: UTC\nschedules: []\nalerts: {to: ['json://localhost']}\n")
+    assert load_alerts(path).to == ["json://localhost"]
+
+
+@contextmanager
+def http_server() -> Iterator[tuple[int, list[Any]]]:
+    """A server that keeps what is posted to it."""
+    posted: list[Any] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Print nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.server_port, posted
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def mail_server() -> Iterator[tuple[int, list[str]]]:
+    """A mail server (SMTP) that keeps what it gets."""
+    mails: list[str] = []
+
+    class Handler(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            self.wfile.write(b"220 test\r\n")
+            while line := self.rfile.readline():
+                verb = line[:4].upper()
+                if verb == b"DATA":
+                    self.wfile.write(b"354 go\r\n")
+                    body = b""
+                    while (part := self.rfile.readline()) != b".\r\n":
+                        body += part
+                    mails.append(body.decode())
+                self.wfile.write(b"221 bye\r\n" if verb == b"QUIT" else b"250 ok\r\n")
+                if verb == b"QUIT":
+                    return
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.server_address[1], mails
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_messages_arrive_by_http_and_by_mail() -> None:
+    with http_server() as (port, posted):
+        target = AppriseTarget(f"json://user:hunter2@127.0.0.1:{port}/x")
+        assert "hunter2" not in target.name
+        assert target.send("SlipLab: s", "the arm did not answer")
+    assert posted[0]["title"] == "SlipLab: s"
+    assert posted[0]["message"] == "the arm did not answer"
+    assert not target.send("SlipLab: s", "again")  # it is gone
+    with mail_server() as (port, mails):
+        address = f"mailto://127.0.0.1:{port}/?from=lab@example.org&to=anna@example.org"
+        assert AppriseTarget(address).send("SlipLab: s", "the disk is full")
+    assert "the disk is full" in mails[0]
+    assert "anna@example.org" in mails[0]
+
+
+def test_the_command_sends_a_test_message_and_says_who_took_it(tmp_path: Path) -> None:
+    Store.create(tmp_path / "s")
+    with http_server() as (port, posted):
+        file = write(tmp_path, to=[f"json://u:hunter2@127.0.0.1:{port}"])
+        done = here("alerts", tmp_path / "s", file, "--test")
+    assert done.returncode == 0, done.stderr
+    assert "taken" in done.stdout
+    assert "hunter2" not in done.stdout + done.stderr
+    assert posted[0]["message"] == "Alerts of s arrive here."
+    assert here("alerts", tmp_path / "s", file, "--test").returncode == 1
