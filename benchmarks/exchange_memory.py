@@ -33,10 +33,10 @@ streams:
 _ENDINGS = {"csv": "csv", "numpy": "npy"}
 
 
-def measure(*forms: str, events: int = 10_000_000) -> Figures:
-    """Peaks of importing files of some formats, or of all, and of exporting what was imported."""
+def measure(events: int = 10_000_000, forms: tuple[str, ...] = FORMS) -> Figures:
+    """Peaks of importing files of some formats, and of exporting what was imported."""
     figures: Figures = {"events": events}
-    for form in forms or FORMS:
+    for form in forms:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
             (folder / "data").mkdir()
