@@ -18,6 +18,7 @@ from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.planning.parameters import Ask, Requester
 from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
+from sliplab.protocols.plugin import plugins
 
 if TYPE_CHECKING:
     from sliplab.flows.collecting.requests import RequestOutcome
@@ -213,11 +214,14 @@ def serve(
 ) -> None:
     """Serve the flows of one rig as Prefect deployments. Ctrl-C stops the arm, then all runs."""
     from sliplab.flows.running.orchestration import configure_prefect
-    from sliplab.flows.server.schedules import load_schedules, upcoming_runs
+    from sliplab.flows.server.schedules import has_alerts, load_schedules, upcoming_runs
     from sliplab.rigs.rig_file import load_rig_file
     from sliplab.rigs.rig_inheritance import rig_path
 
     found = [] if schedules is None else load_schedules(schedules)
+    alerts = schedules if schedules is not None and has_alerts(schedules) else None
+    if alerts is not None:
+        plugins().hook("check_alerts")(alerts)
     file, _ = load_rig_file(rig)
     named = schedules or Path()
     if check:
@@ -258,6 +262,7 @@ def serve(
         folders=[Path.cwd(), *([] if schedules is None else [schedules.parent])],
         port=port,
         poll_s=poll,
+        alerts=alerts,
     )
     if as_json:
         console.print_json({"served": str(store), "name": name or file.name})

@@ -29,7 +29,14 @@ from sliplab.flows.planning.parameters import CollectOptions, Rule, SessionMetad
 from sliplab.protocols import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean, one_of
-from sliplab.protocols.yaml_file import StrictModel, parse_leniently, read_text, rule, validate
+from sliplab.protocols.yaml_file import (
+    StrictModel,
+    parse_leniently,
+    parse_yaml,
+    read_text,
+    rule,
+    validate,
+)
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"
@@ -275,6 +282,15 @@ def load_schedules(path: Path) -> list[Scheduled]:
     if faults:
         raise InputError.joined(faults)
     return made
+
+
+def has_alerts(path: Path) -> bool:
+    """Return whether a file of schedules has the section ``alerts:``.
+
+    Raises:
+        InputError: it is not YAML.
+    """
+    return parse_yaml(read_text(path, "schedule file"), path).get("alerts") is not None
 
 
 def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:

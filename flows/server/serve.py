@@ -13,6 +13,7 @@ from uuid import UUID
 
 from sliplab import protocols
 from sliplab.flows.running import console, run_records
+from sliplab.flows.server.alerting import keep_alerting
 from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
 from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
@@ -37,6 +38,7 @@ def serve(
     folders: Sequence[Path],
     port: int = PORT,
     poll_s: float = 3.0,
+    alerts: Path | None = None,
 ) -> None:
     """Register the deployments and run what is requested, until SIGINT or SIGTERM.
 
@@ -47,6 +49,7 @@ def serve(
             that ship, and those that a schedule names, it may name as well.
         port: of the embedded server's page.
         poll_s: how often the server is polled for new runs, s.
+        alerts: a file with the section ``alerts:``, which another program sends (`alerting`).
 
     Raises:
         Locked: another program serves this store.
@@ -65,11 +68,16 @@ def serve(
         here.export_environment()
         for item in run_records.close_killed_runs(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
-        asyncio.run(_serve(here, schedules, url, page, poll_s))
+        asyncio.run(_serve(here, schedules, url, page, poll_s, alerts))
 
 
 async def _serve(
-    here: Service, schedules: Sequence[Scheduled], url: str, page: PageServer | None, poll_s: float
+    here: Service,
+    schedules: Sequence[Scheduled],
+    url: str,
+    page: PageServer | None,
+    poll_s: float,
+    alerts: Path | None,
 ) -> None:
     from prefect.settings import (
         PREFECT_API_REQUEST_TIMEOUT,
@@ -104,6 +112,7 @@ async def _serve(
     with temporary_settings(updates=limits):
         carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
+    alerting = asyncio.create_task(keep_alerting(here.folder, alerts, stopped))
     ending = asyncio.create_task(stopped.wait())
     shown = ", ".join(deployment_name(flow.name, here.name) for flow in (ON_RIG[0], *CONTROL))
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments {shown} and others")
@@ -111,7 +120,9 @@ async def _serve(
     await asyncio.wait([ending, carrying_out], return_when=asyncio.FIRST_COMPLETED)
     console.say("stopping: the arm first, then all runs")
     stopped.set()
-    for outcome in await asyncio.gather(carrying_out, watching, ending, return_exceptions=True):
+    for outcome in await asyncio.gather(
+        carrying_out, watching, alerting, ending, return_exceptions=True
+    ):
         if isinstance(outcome, Exception):
             raise outcome
 

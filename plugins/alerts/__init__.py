@@ -4,4 +4,8 @@ from __future__ import annotations
 
 from sliplab.protocols.plugin import Plugin
 
-PLUGIN = Plugin(commands={"alerts": "sliplab.plugins.alerts.command:app"})
+_ALERTS = "sliplab.plugins.alerts"
+PLUGIN = Plugin(
+    commands={"alerts": f"{_ALERTS}.command:app"},
+    hooks={"check_alerts": f"{_ALERTS}.settings:load_alerts"},
+)
