@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tomllib
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -29,7 +28,7 @@ from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
-from tests.examples.conftest import EXAMPLES
+from tests.examples.conftest import install
 from tests.flows.class_store import adapter, class_store
 
 Ran = tuple[list[RunRequest], StudyOutcome]
@@ -38,18 +37,7 @@ Ran = tuple[list[RunRequest], StudyOutcome]
 @pytest.fixture
 def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Install the package by what an installer writes, for one test."""
-    project = tomllib.loads((EXAMPLES / "lab-subject" / "pyproject.toml").read_text())["project"]
-    info = tmp_path / "site" / "lab_subject-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lab-subject\nVersion: 0.1.0\n")
-    lines = [
-        line
-        for group, points in project["entry-points"].items()
-        for line in (f"[{group}]", *(f"{name} = {place}" for name, place in points.items()))
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines))
-    for folder in (info.parent, EXAMPLES / "lab-subject"):
-        monkeypatch.syspath_prepend(str(folder))
+    install("lab-subject", tmp_path / "site", monkeypatch)
     groups, added = list(cli.app.registered_groups), set(cli._added)
     plugins.cache_clear()
     yield
