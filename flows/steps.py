@@ -57,12 +57,7 @@ def located(place: str) -> Path:
     if not is_url(place):
         return Path(place)
     with console.bar(f"read {place} (trials)", 0) as bar:
-
-        def seen(name: str) -> None:
-            bar.extend(1)
-            bar.advance(1, name)
-
-        store, done = open_mirror(place, seen)
+        store, done = open_mirror(place, bar.count)
     for problem in done.problems:
         console.say(f"skipped: {problem}")
     console.say(f"working on {store.folder}; events and videos are downloaded when first read")

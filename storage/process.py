@@ -15,6 +15,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,8 +167,40 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-def start_tethered(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a foreign program in a new session, out of reach of the terminal's signals.
+class Child(subprocess.Popen[bytes]):
+    """A program in a session of its own, out of reach of the terminal's signals.
+
+    Args:
+        options: of `subprocess.Popen`.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self, command: Sequence[str], **options: Any) -> None:
+        super().__init__(command, start_new_session=True, **options)
+
+    def stop(self, limit_s: float, *, at_once: bool = False, group: bool = False) -> None:
+        """End the program, and wait for that; safe to call more than once, in any thread.
+
+        Args:
+            limit_s: time to end when asked, and again when killed.
+            at_once: kill it without asking first.
+            group: end what it started, too, which may outlive it.
+        """
+        send = partial(os.killpg, self.pid) if group else self.send_signal
+        # one that was stopped would not see that it is asked
+        asked = [] if at_once else [(signal.SIGTERM, signal.SIGCONT)]
+        for numbers in (*asked, (signal.SIGKILL,)):
+            for number in numbers:
+                with suppress(ProcessLookupError):
+                    send(number)
+            with suppress(subprocess.TimeoutExpired):
+                self.wait(limit_s)
+
+
+def start_tethered(command: Sequence[str], **options: Any) -> Child:
+    """Start a foreign program that ends with this process.
 
     The kernel kills it and its process group when this process ends, however it ends: it does so
     when the last writer of a pipe is gone that the program inherits.
@@ -180,7 +213,7 @@ def start_tethered(command: Sequence[str], **options: Any) -> subprocess.Popen[b
     """
     theirs, ours = os.pipe()
     try:
-        process = subprocess.Popen(command, start_new_session=True, pass_fds=[theirs], **options)
+        process = Child(command, pass_fds=[theirs], **options)
         weakref.finalize(process, os.close, ours)
         with suppress(OSError):  # a kernel without it
             fcntl.fcntl(theirs, fcntl.F_SETOWN, -process.pid)

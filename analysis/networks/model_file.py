@@ -105,5 +105,6 @@ def parse(data: bytes, name: str) -> Fitted:
         pickle.UnpicklingError,
         zipfile.BadZipFile,
     ) as error:
-        raise ValueError(f"{name}: not a model file of this program: {error}") from error
+        reason = "PyTorch did not write it" if isinstance(error, zipfile.BadZipFile) else error
+        raise ValueError(f"{name}: not a model file of this program: {reason}") from error
     return fitted

@@ -68,7 +68,7 @@ _EXPECTED = {
     "MainModuleError",
 }
 """Errors that need no traceback, by name: their modules are slow to import."""
-_OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|STORE|TRIAL|URL|WHAT")
+_OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|PATH|STORE|TRIAL|URL|WHAT")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""
 
 
@@ -224,6 +224,8 @@ def _wrong_usage(error: TyperException) -> Failure:
         found = error.__cause__.errors()[0]
         value = str(found["input"])
         expected = re.sub("^Input should", "must", found["msg"].removeprefix("Value error, "))
+        if value.lower().lstrip("+-") == "nan":
+            expected = "must be a number"
         message = f"{key} = {value}: {expected}"
     if message:
         message += " (see --help)"

@@ -40,6 +40,7 @@ def model_options(command: Callable[..., None]) -> Callable[..., None]:
             given[name] = _made(model, {key: given.pop(key) for key in model.model_fields})
         command(**given)
 
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run
 

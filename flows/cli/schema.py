@@ -20,11 +20,12 @@ app = typer.Typer()
 )
 def schema(
     kind: Annotated[
-        str,
+        str | None,
         typer.Argument(
-            help="Kind of file, such as protocol, rig or trial; another word lists them."
+            help="Kind of file, such as protocol, rig or trial; without it, all are listed.",
+            show_default=False,
         ),
-    ],
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -32,6 +33,12 @@ def schema(
     from sliplab.flows.planning.schema import file_schema, kinds
     from sliplab.storage.files import make_folder, write_json
 
+    if kind is None:
+        if as_json:
+            console.print_json({"kinds": kinds()})
+        else:
+            console.show("\n".join(kinds()))
+        return
     if kind not in kinds():
         raise InputError("KIND", "", kind, one_of(kind, kinds()))
     made = file_schema(kind)

@@ -254,17 +254,12 @@ def pull(
     from sliplab.storage.remote.pull import pull as pull_trials
 
     with console.bar(f"pull {url} (trials)", 0) as bar:
-
-        def seen(name: str) -> None:
-            bar.extend(1)
-            bar.advance(1, name)
-
         done = pull_trials(
             Remote(url),
             store,
             campaigns=campaign,
             quarantine=quarantine,
-            on_trial=seen,
+            on_trial=bar.count,
             on_bytes=lambda _: bar.advance(0),
         )
     _finish({"url": url, "store": str(store), **vars(done)}, "pull", as_json)

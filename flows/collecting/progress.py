@@ -230,7 +230,8 @@ class _Page:
             self._answered(self._report_name, client)
             while not self._over.wait(PERIOD_S):
                 for report in (self._report_lines, self._report_pause, self._report_progress):
-                    self._answered(report, client)
+                    if not self._answered(report, client):
+                        break
             # the rig is free before the figure, which takes longest, is drawn
             public = [lambda client: self._rig(client, False), self._report_figure]
             last = [self._report_lines, self._report_progress, self._report_table]
@@ -244,16 +245,17 @@ class _Page:
                 except Exception:
                     continue
 
-    def _answered(self, report: Callable[..., None], *about: Any) -> None:
-        """Send a report; after `LOST_AFTER` failures in a row the server is lost."""
+    def _answered(self, report: Callable[..., None], *about: Any) -> bool:
+        """Return whether the server took a report; after `LOST_AFTER` failures it is lost."""
         try:
             report(*about)
         except Exception as error:
             self._misses += 1
             if self._misses == LOST_AFTER:
                 orchestration.report_unreachable(orchestration.reason_of(error))
-        else:
-            self._misses = 0
+            return False
+        self._misses = 0
+        return True
 
     def _rig(self, client: Any, busy: bool) -> None:
         """Show on a public server whether the rig is in use; the lock is elsewhere."""

@@ -282,6 +282,11 @@ class ProgressBar:
             if task.id == self._task:
                 self._progress.update(self._task, total=(task.total or 0) + count)
 
+    def count(self, name: str) -> None:
+        """Count one that was not expected: of a bar whose total is not known."""
+        self.extend(1)
+        self.advance(1, name)
+
 
 @contextmanager
 def bar(title: str, total: float, left: str | None = None) -> Iterator[ProgressBar]:

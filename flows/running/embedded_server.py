@@ -35,6 +35,7 @@ from typing import Any
 
 from sliplab.flows.running.process import collect_garbage_seldom, die_with
 from sliplab.flows.running.same_origin import SameOrigin
+from sliplab.storage.process import Child
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -93,7 +94,7 @@ class EmbeddedServer:
             # the server inherits the open socket: another program could take a free number first.
             # Above the standard streams: with one of these closed, the port would have its number
             handle = fcntl.fcntl(listener, fcntl.F_DUPFD_CLOEXEC, 3)
-            self._process = subprocess.Popen(
+            self._process = Child(
                 [
                     *(sys.executable, "-P", "-m", "sliplab.flows.running.embedded_server"),
                     *(str(handle), str(os.getpid()), str(home)),
@@ -101,7 +102,6 @@ class EmbeddedServer:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                start_new_session=True,
                 pass_fds=[handle],
                 env={**kind, **retained, **_closed(self.port, self.password)},
             )
@@ -192,13 +192,7 @@ class EmbeddedServer:
 
     def stop(self) -> None:
         """End the server; safe to call more than once."""
-        self._process.terminate()
-        self._process.send_signal(signal.SIGCONT)  # one that was stopped would not see it
-        try:
-            self._process.wait(timeout=STOP_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait(timeout=STOP_LIMIT_S)
+        self._process.stop(STOP_LIMIT_S)
 
 
 def new_password() -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
 
 from sliplab.flows.running import console
-from sliplab.storage.process import start_tethered
+from sliplab.storage.process import Child, start_tethered
 
 AGAIN_S = 60.0
 """Wait before it is started again, s."""
@@ -36,17 +35,14 @@ async def keep_alerting(store: Path, file: Path | None, stopped: asyncio.Event) 
             await asyncio.wait_for(stopped.wait(), AGAIN_S)
 
 
-async def _ended(child: subprocess.Popen[bytes], stopped: asyncio.Event) -> None:
+async def _ended(child: Child, stopped: asyncio.Event) -> None:
     """Wait for the child's end, or end it when the service stops."""
     ending = asyncio.create_task(asyncio.to_thread(child.wait))
     stopping = asyncio.create_task(stopped.wait())
     await asyncio.wait([ending, stopping], return_when=asyncio.FIRST_COMPLETED)
-    if not ending.done():
-        child.terminate()
-        done, _ = await asyncio.wait([ending], timeout=END_S)
-        if not done:
-            child.kill()
-    else:
+    if ending.done():
         console.say(f"alerts ended with exit code {child.returncode}; they are started again")
+    else:
+        await asyncio.to_thread(child.stop, END_S)
     await ending
     stopping.cancel()

@@ -52,25 +52,22 @@ def _zone(name: str) -> str:
     return name
 
 
-def _until(text: str) -> str:
-    if not _UNTIL.fullmatch(text):
-        raise ValueError('must be a time like "06:00", or a day and a time like "mon 06:00"')
-    return text
+def _matching(pattern: re.Pattern[str], right: str) -> AfterValidator:
+    """Return the check of a text; `right` says in a message what it must be."""
+
+    def check(text: str) -> str:
+        if not pattern.fullmatch(text):
+            raise ValueError(right)
+        return text
+
+    return AfterValidator(check)
 
 
-def _from(text: str) -> str:
-    if not _FROM.fullmatch(text):
-        raise ValueError('must be a time like "22:00", quoted')
-    return text
-
-
-def _name(text: str) -> str:
-    if not _NAME.fullmatch(text):
-        raise ValueError("must be letters a-z, digits, blanks, - and _")
-    return text
-
-
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, _matching(_NAME, "must be letters a-z, digits, blanks, - and _")]
+Until = Annotated[
+    str, _matching(_UNTIL, 'must be a time like "06:00", or a day and a time like "mon 06:00"')
+]
+From = Annotated[str, _matching(_FROM, 'must be a time like "22:00", quoted')]
 _FIELDS = (
     "five fields, minute, hour, day of the month, month and day of the week, such as "
     '"0 22 * * mon-thu"'
@@ -86,8 +83,6 @@ def _five(text: str) -> str:
 
 Cron = Annotated[str, AfterValidator(_five)]
 Zone = Annotated[str, AfterValidator(_zone)]
-Until = Annotated[str, AfterValidator(_until)]
-From = Annotated[str, AfterValidator(_from)]
 
 
 def window_end(due: datetime, until: str, zone: str) -> datetime:

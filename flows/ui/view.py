@@ -22,10 +22,9 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -42,7 +41,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import RATE_NS, event_rate
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
-from sliplab.storage.process import start_tethered
+from sliplab.storage.process import Child, start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, SCALAR, WRENCH, EventChunk
 from sliplab.storage.trials import review
@@ -135,7 +134,7 @@ passes the file to any program that listens on its usual port, maybe another use
 
 
 @contextmanager
-def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[Child]:
     """Run Rerun's program while the block runs; nothing of it is left afterwards.
 
     It has its own session, because it starts another program, which outlives it otherwise.
@@ -145,13 +144,7 @@ def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.
     try:
         yield process
     finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(10)
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait(10)
+        process.stop(10, group=True)
 
 
 def program() -> str:
@@ -326,6 +319,13 @@ def _further(to: _Columns, recording: Recording) -> None:
             time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
             to.once(path, to.rr.SeriesLines(names=f"{name} ({found.unit})"))
             to.scalars(path, time_ns, found.value, count)
+        elif about.kind != WRENCH.name:
+            samples = recording.samples(name)
+            time_ns = samples.pop("t")
+            to.sent[count] = len(time_ns)
+            for part, values in samples.items():
+                for index, component in enumerate(values.reshape(len(time_ns), -1).T):
+                    to.scalars(f"{path}/{part}/{index}", time_ns, component)
 
 
 def _pictures(to: _Columns, recording: Recording, stream: str, path: str, count: str = "") -> None:
@@ -505,7 +505,8 @@ def blueprint(
     """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
-    curves_of = _named(further, SCALAR.name, WRENCH.name)
+    cameras = _named(further, FRAMES_KIND, EVENTS_KIND)
+    curves_of = [name for name in sorted(further or {}) if name not in cameras]
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (
@@ -522,10 +523,7 @@ def blueprint(
         views.Spatial2DView(origin="/camera", name="outside camera, markers"),
         views.Spatial2DView(origin="/events", name="events"),
         views.Spatial3DView(origin="/arm", name="arm (mm)"),
-        *(
-            views.Spatial2DView(origin=f"/streams/{name}", name=name)
-            for name in _named(further, FRAMES_KIND, EVENTS_KIND)
-        ),
+        *(views.Spatial2DView(origin=f"/streams/{name}", name=name) for name in cameras),
     ]
     words = views.Horizontal(
         views.TextDocumentView(origin="/trial"), views.TextLogView(origin="/onset_log")

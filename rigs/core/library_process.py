@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
+from sliplab.storage.process import Child
 from sliplab.storage.spawn_context import refuse_main
 
 T = TypeVar("T")
@@ -159,14 +160,6 @@ def _end_late(calls: weakref.ref[PipeCalls], closed: threading.Event) -> None:
         del watched
 
 
-def _kill(child: subprocess.Popen[bytes]) -> None:
-    """End a child now, whatever it is doing; safe to call more than once."""
-    if child.poll() is None:
-        child.kill()
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        child.wait(KILL_S)
-
-
 class LibraryProcess:
     """The parent's side: remote calls by name, each with a timeout.
 
@@ -209,17 +202,16 @@ class LibraryProcess:
             f"{function}({given})"
         )
         with theirs:
-            self._child = subprocess.Popen(
+            self._child = Child(
                 [sys.executable, "-c", code],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                start_new_session=True,  # Ctrl-C is the parent's to handle
             )
         self._calls = PipeCalls(
             Connection(ours.detach()),
-            partial(_kill, self._child),
+            partial(self._child.stop, KILL_S, at_once=True),
             pending=1,
             ignore_suspend=ignore_suspend,
         )
@@ -248,7 +240,7 @@ class LibraryProcess:
 
     def kill(self) -> None:
         """End the child now, whatever it is doing; safe to call more than once."""
-        _kill(self._child)
+        self._child.stop(KILL_S, at_once=True)
 
     def end(self) -> None:
         """Ask the child to end, kill it if it does not within `KILL_S`, and close."""

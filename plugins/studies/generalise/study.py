@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.analysis.study import Finding, Study
-from sliplab.flows.cli.common import CampaignOption, StoreArgument, opened_campaigns
+from sliplab.flows.cli.common import CampaignOption, PlaceArgument, opened_campaigns
+from sliplab.flows.steps import located
 from sliplab.plugins.studies.generalise.document import (
     GeneralisationResults,
     NotTrained,
@@ -25,7 +26,7 @@ Results = Mapping[str, UnseenScores | NotTrained]
 
 
 def measure(
-    folder: StoreArgument,
+    folder: PlaceArgument,
     factor: Annotated[
         list[str] | None, typer.Option("--factor", help="Only this factor. Repeatable.")
     ] = None,
@@ -53,7 +54,7 @@ def measure(
     campaign: CampaignOption = None,
 ) -> Finding[GeneralisationResults]:
     """Test the network on levels left out of training and on other simulated skins."""
-    store, campaigns = opened_campaigns(folder, campaign)
+    store, campaigns = opened_campaigns(located(folder), campaign)
     from sliplab.plugins.studies.generalise.run import measure_generalisation
 
     return measure_generalisation(

@@ -99,7 +99,7 @@ OPTIONS = _options(command_line())
 
 def test_numeric_options_are_bounded() -> None:
     assert len(OPTIONS) > 40
-    assert {"evaluate margin", "collect temperature"} <= OPTIONS.keys()
+    assert {"evaluate margin", "collect temperature_c"} <= OPTIONS.keys()
     assert [name for name, (_, info) in OPTIONS.items() if None in (info.min, info.max)] == []
 
 
@@ -140,3 +140,24 @@ def test_options_take_finite_numbers_alone(command: str, value: str) -> None:
 )
 def test_levels_to_be_enabled(given: str, message: str) -> None:
     assert message in refused("plan", ROOT / "protocols" / "pilot.yaml", "--enable", given)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("holdout", "s3://bucket/x"), "STORE = s3://bucket/x: must be a path"),
+        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "--store = s3://b/x: must be"),
+        (
+            ("import", "file:///x", "--store", "x", "--name", "x"),
+            "PATH = file:///x: must be a path",
+        ),
+        (("evaluate", "x", "--margin", "nan"), "--margin = nan: must be a number"),
+        (("pause", "x", "--wait", "-1"), "--wait = -1: must be greater than or equal to 0"),
+    ],
+)
+def test_option_or_argument_of_another_kind_is_refused(words: tuple[str, ...], says: str) -> None:
+    assert says in refused(*words)
+
+
+def test_schema_without_a_kind_lists_the_kinds() -> None:
+    assert here("schema").stdout.split()[:3] == ["protocol", "rig", "adapter"]

@@ -105,6 +105,24 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
 
 
 @pytest.mark.long
+def test_pause_is_shown_on_the_page_only_while_the_run_is_running(server: EmbeddedServer) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.states import Completed, Running
+
+    from sliplab.flows.server.deployments import collect
+
+    with get_client(sync_client=True) as client:
+        run = client.create_flow_run(collect, state=Running()).id
+        orchestration.show_running(client, run, "Paused", "paused before A (pause by anna: lunch)")
+        paused = client.read_flow_run(run).state
+        client.set_flow_run_state(run, Completed(), force=True)
+        orchestration.show_running(client, run, "Paused", "")
+        ended = client.read_flow_run(run).state
+    assert (paused.type.value, paused.name) == ("RUNNING", "Paused")
+    assert "anna: lunch" in paused.message
+    assert ended.is_completed()
+
+
 def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: Path) -> None:
     from sliplab.flows.server.deployments import collect
 
