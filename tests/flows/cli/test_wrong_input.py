@@ -145,11 +145,11 @@ def test_levels_to_be_enabled(given: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("holdout", "s3://bucket/x"), "STORE = s3://bucket/x: must be a path"),
-        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "--store = s3://b/x: must be"),
+        (("holdout", "s3://bucket/x"), "s3:/bucket/x: is a URL, not a folder"),
+        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "s3:/b/x: is a URL"),
         (
             ("import", "file:///x", "--store", "x", "--name", "x"),
-            "PATH = file:///x: must be a path",
+            "file:/x: is a URL",
         ),
         (("evaluate", "x", "--margin", "nan"), "--margin = nan: must be a number"),
         (("pause", "x", "--wait", "-1"), "--wait = -1: must be greater than or equal to 0"),
