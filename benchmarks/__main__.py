@@ -27,6 +27,7 @@ NAMES = (
     "orchestration",
     "acquisition",
     "scale",
+    "exchange_memory",
     "fewer",
     "statements",
 )

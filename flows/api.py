@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sliplab.flows.notebook.torch_windows import TorchWindows
     from sliplab.flows.planning.preflight import Checks
     from sliplab.flows.steps import StepResult
-    from sliplab.flows.verify import Verified
+    from sliplab.flows.verify import Verification
     from sliplab.protocols.windows import Windows
 
 __all__ = [
@@ -167,12 +167,17 @@ class Store:
             return run_evaluation(self.folder, names, **options)
 
     def windows(
-        self, split: str | None = None, campaigns: Sequence[str] | None = None
+        self,
+        split: str | None = None,
+        campaigns: Sequence[str] | None = None,
+        *,
+        reviewed: bool = False,
     ) -> pd.DataFrame:
         """The windows by which models are trained and judged, by trial and time.
 
         Args:
             split: ``train``, ``validation`` or ``test``; all of them by default.
+            reviewed: apply the decisions made in a review; for an evaluation that does.
 
         Returns:
             a row for each window: ``campaign``, ``trial``, ``split``; ``start_ns`` and ``end_ns``
@@ -192,7 +197,8 @@ class Store:
             raise InputError("split", "", split, one_of(split, SPLITS))
         found = collected(self._store, None if campaigns is None else list(campaigns))
         need_slip(found)
-        return window_table(StoreLabels(self._store), found, SPLITS if split is None else (split,))
+        splits = SPLITS if split is None else (split,)
+        return window_table(StoreLabels(self._store, reviewed), found, splits)
 
     def torch_dataset(
         self, split: str = "train", *, windows: pd.DataFrame | None = None
@@ -251,7 +257,7 @@ class Store:
 
         return event_counts(self._store, windows, shape or self._settings())
 
-    def verify(self, *, quarantine: bool = False) -> Verified:
+    def verify(self, *, quarantine: bool = False) -> Verification:
         """Check every checksum, count and clock of the store; see `sliplab.verify`."""
         return verify(self.folder, quarantine=quarantine)
 
@@ -270,10 +276,17 @@ class Store:
         Raises:
             StoreError: there is no report yet.
         """
-        path = self.folder / "report" / "summary.json"
-        if not path.exists():
-            raise StoreError(f"{path}: does not exist; run `Store.report` first")
-        return read_json(path)
+        return read_json(self._reported("summary.json"))
+
+    def scores(self) -> pd.DataFrame:
+        """The figures of the last report and its trials' results, a row each (docs/summary.md).
+
+        Raises:
+            StoreError: there is no report yet, or it is of an older version.
+        """
+        import pandas as pd
+
+        return pd.read_parquet(self._reported("scores.parquet"))
 
     def models(self) -> list[Path]:
         """Files of the networks that were trained here."""
@@ -304,6 +317,12 @@ class Store:
             for item in self._store.campaigns()
         ]
         return table_html(f"Store {self.folder}", ("campaign", "trials", "simulated"), rows)
+
+    def _reported(self, name: str) -> Path:
+        path = self.folder / "report" / name
+        if not path.exists():
+            raise StoreError(f"{path}: does not exist; run `Store.report` first")
+        return path
 
     def _run(self, step: str, campaigns: Sequence[str] | None) -> StepResult:
         from sliplab.flows.running import extras, stopping
@@ -487,7 +506,7 @@ def check(
     return preflight.checks_json(found)
 
 
-def verify(place: str | Path, *, quarantine: bool = False) -> Verified:
+def verify(place: str | Path, *, quarantine: bool = False) -> Verification:
     """Check every checksum, count and clock of a store, as ``sliplab verify`` does.
 
     Args:
@@ -559,7 +578,7 @@ def export(
     Args:
         place: a store's folder or URL, or a model's file.
         form: its name, such as ``aedat4``, ``dsec``, ``labels`` or ``croissant``.
-        output: folder to write, or file for labels.
+        output: folder to write, or file for labels or samples.
         part: a campaign or a trial of the store, where the form is of one.
         options: of the form: ``campaign``, ``title``, ``creator``, ``licence``, ``stream``,
             ``store``, ``windows``.
@@ -589,6 +608,10 @@ def collect(
     trials: int | None = None,
     campaign: str | None = None,
     enable: Iterable[str] = (),
+    operator: str = "",
+    temperature: float | None = None,
+    humidity: float | None = None,
+    note: str = "",
     no_stopping: bool = False,
 ) -> Store:
     """Take the trials of a protocol that a store lacks, on a rig.
@@ -600,6 +623,8 @@ def collect(
         trials: take this many at most.
         campaign: name of the campaign; the protocol's by default.
         enable: optional levels to switch on, as ``factor=level``.
+        operator, note: stored with the session.
+        temperature, humidity: of the room, degrees Celsius and percent, stored as well.
         no_stopping: the protocol's claims do not end the campaign.
 
     Raises:
@@ -608,21 +633,29 @@ def collect(
         sliplab.CampaignStopped: collection cannot continue; the message says why.
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
+    from pydantic import ValidationError
+
+    from sliplab.flows.planning.parameters import CollectOptions
     from sliplab.flows.planning.run_request import make_request
     from sliplab.flows.running import extras, stopping
     from sliplab.flows.steps import prepare_store
+    from sliplab.protocols.key_errors import faults_of
 
-    if trials is not None and trials < 1:
-        raise InputError("trials", "", trials, "must be 1 or more")
-    run_request = make_request(
-        Path(protocol),
-        Path(rig),
-        Path(store),
-        enable=tuple(enable),
-        campaign=campaign,
-        most=trials,
-        claims="overrule" if no_stopping else "use",
-    )
+    try:
+        options = CollectOptions(
+            enable=list(enable),
+            trials=trials,
+            campaign=campaign,
+            operator=operator,
+            temperature_c=temperature,
+            humidity_percent=humidity,
+            note=note,
+            no_stopping=no_stopping,
+        )
+    except ValidationError as error:
+        fault = faults_of(CollectOptions, error)[0]
+        raise InputError(fault.key, "", fault.value, str(fault)) from None
+    run_request = make_request(Path(protocol), Path(rig), Path(store), **options.arguments())
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)
         from sliplab.flows.collect import collect as take

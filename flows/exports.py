@@ -74,7 +74,7 @@ def export_names() -> list[str]:
     """Return the names of all forms."""
     from sliplab.storage.formats.known import export_formats
 
-    return [*export_formats(), "labels", *plugins().declared("exports")]
+    return [*export_formats(), "labels", "samples", *plugins().declared("exports")]
 
 
 def fitting_forms(place: str) -> str:
@@ -102,6 +102,8 @@ def known_export(name: str) -> Export:
 
     if name == "labels":
         return Export("trials", _labels)
+    if name == "samples":
+        return Export("trials", _samples, frozenset({"stream"}))
     if name in format_names() and known_format(name).export is not None:
         return Export("trials", _trials, frozenset({"stream"}))
     places = plugins().declared("exports")
@@ -184,6 +186,20 @@ def _labels(request: ExportRequest) -> ExportResult:
     return ExportResult(
         f"labels of {request.part}", {"labels": len(table), "output": str(request.output)}
     )
+
+
+def _samples(request: ExportRequest) -> ExportResult:
+    """Write the samples of one stream of trials as a table."""
+    from sliplab.storage.formats.export_trials import sample_table
+    from sliplab.storage.trials.catalogue import check_table_path, write_table
+
+    check_table_path(request.output)
+    _, campaign, names = _chosen(request)
+    stream = request.options.get("stream", "force")
+    table = sample_table((campaign.recording(name) for name in names), stream)
+    write_table(table, request.output)
+    found = {"samples": len(table), "output": str(request.output)}
+    return ExportResult(f"samples of {stream} of {request.part}", found)
 
 
 def _trials(request: ExportRequest) -> ExportResult:

@@ -120,16 +120,16 @@ def judge_predictions(
         InputError: the table; all its faults at once.
         StoreError: a trial has no label yet.
     """
-    from sliplab.analysis.evaluation.predictions import predicted
+    from sliplab.analysis.evaluation.predictions import prediction_judgement
 
     need_slip(campaigns)
     labels = StoreLabels(store, reviewed)
-    return _scores(predicted(labels, campaigns, predictions, margin, smoothing), cluster)
+    return _scores(prediction_judgement(labels, campaigns, predictions, margin, smoothing), cluster)
 
 
 def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
     """Judge a network, and return its stored figures."""
-    done = _judge(judgement, cluster)
+    done = judge(judgement, cluster)
     store, campaigns, network = judgement.store, judgement.campaigns, judgement.network
     found = Derived.of(store, networks.STEP).load(network.name, OtherEvaluation)
     experiments = summaries(found.trials)
@@ -154,24 +154,7 @@ def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
     }
 
 
-def evaluate_comparison(
-    store: Store,
-    campaigns: list[Collected],
-    cluster: Cluster | None = None,
-    reviewed: bool = False,
-) -> bool:
-    """Judge the network that `analysis.also` asks for; return True if there was anything to do.
-
-    Raises:
-        StoreError: it is missing or stale.
-    """
-    done = False
-    for judgement in networks.comparison_judgements(StoreLabels(store, reviewed), campaigns):
-        done |= _judge(judgement, cluster)
-    return done
-
-
-def _judge(judgement: Judgement, cluster: Cluster | None) -> bool:
+def judge(judgement: Judgement, cluster: Cluster | None) -> bool:
     """Judge a network if anything changed; return True if it did."""
     stale = not judgement.fresh
     if stale:

@@ -8,10 +8,11 @@ faults.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.mock.settings import ClockErrors
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
+from sliplab.storage.streams import Chunk, EventChunk, NullSink
 
 MOTION = frozenset(ACTING)
 PERFECT = ClockErrors(
@@ -34,6 +35,7 @@ PERFECT = ClockErrors(
     frame_jitter_us=0,
 )
 _SMALL_PX = 32
+ChunkT = TypeVar("ChunkT", bound=Chunk)
 
 
 Onsets = tuple[int | None, int | None]
@@ -84,24 +86,19 @@ def ideal(rig: RigFile) -> RigFile:
     return changed(with_true_times(rig), {"event_camera": camera})
 
 
-@dataclass
 class Memory(NullSink):
-    """A sink that keeps what analyses of simulated trials need."""
+    """A sink that keeps everything."""
 
-    events: list[EventChunk] = field(default_factory=list)
-    frames: list[FrameChunk] = field(default_factory=list)
-    poses: list[PoseChunk] = field(default_factory=list)
-    forces: list[WrenchChunk] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._chunks = defaultdict[tuple[str, type[Chunk]], list[Any]](list)
 
     def add(self, device: str, chunk: Chunk) -> None:
-        if isinstance(chunk, EventChunk):
-            self.events.append(chunk)
-        elif isinstance(chunk, FrameChunk):
-            self.frames.append(chunk)
-        elif isinstance(chunk, PoseChunk):
-            self.poses.append(chunk)
-        elif isinstance(chunk, WrenchChunk) and device == "force":
-            self.forces.append(chunk)
+        if len(chunk):
+            self._chunks[device, type(chunk)].append(chunk)
+
+    def taken(self, device: str, chunk: type[ChunkT]) -> ChunkT:
+        """Return all that a device sent in chunks of a type, as one."""
+        return chunk.concatenate(self._chunks[device, chunk])
 
 
 def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
@@ -121,7 +118,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
         built.close()
     start_ns = next(step.start_ns for step, _ in done.steps if step.phase in MOTION)
     begin_us, end_us = ((t - start_ns) // 1000 for t in done.recorded_ns)
-    events, truth = EventChunk.concatenate(sink.events), done.truth
+    events, truth = sink.taken("events", EventChunk), done.truth
     assert truth is not None, "a simulated rig has a truth"
     t_us = events.t_us - start_ns // 1000
     inside = slice(*np.searchsorted(t_us, (begin_us, end_us)))

@@ -19,7 +19,7 @@ from sliplab.storage.trials.verify import (
 from sliplab.storage.trials.verify import verify as find_problems
 
 
-class Verified(TypedDict):
+class Verification(TypedDict):
     """What a verification found, as ``sliplab verify --json`` prints it.
 
     Attributes:
@@ -44,7 +44,7 @@ class Verified(TypedDict):
     failed_gates: NotRequired[dict[str, list[str]]]
 
 
-def verify(place: str, quarantine: bool = False) -> Verified:
+def verify(place: str, quarantine: bool = False) -> Verification:
     """Check every checksum, count and clock; close files that others left open.
 
     Args:
@@ -71,7 +71,7 @@ def verify(place: str, quarantine: bool = False) -> Verified:
         with store_lock(opened):
             moved = quarantine_damaged(opened, problems)
     damaged = _damaged(problems)
-    result: Verified = {
+    result: Verification = {
         "trials": total,
         "whole": total - damaged,
         "damaged": damaged,
@@ -89,7 +89,7 @@ def verify(place: str, quarantine: bool = False) -> Verified:
     return result
 
 
-def _verify_pushed(url: str, quarantine: bool) -> Verified:
+def _verify_pushed(url: str, quarantine: bool) -> Verification:
     if quarantine:
         raise InputError(
             "--quarantine",

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, need_slip, of_classes
+from sliplab.analysis.campaigns import Collected, need_slip
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
@@ -24,7 +24,8 @@ from sliplab.analysis.networks.window_checks import (
     permuted,
     shuffled_chance,
 )
-from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
+from sliplab.analysis.problem import problem_of
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
@@ -64,10 +65,10 @@ def window_baselines(
     Args:
         reviewed: people's decisions are applied to the labels.
     """
-    classes = of_classes(campaigns)
-    methods = baselines.class_methods(campaigns) if classes else baselines.slip_methods()
-    of, make = methods.prefix, load_class_samples if classes else load_samples
-    train, validation, test = map(partial(make, StoreLabels(store, reviewed), campaigns), SPLITS)
+    problem = problem_of(StoreLabels(store, reviewed), campaigns)
+    methods = problem.baselines()
+    of = methods.prefix
+    train, validation, test = map(problem.samples, SPLITS)
     stored = Derived.of(store, baselines.STEP)
     keys = {name: methods.key(store, name) for name in methods.names}
     stale = [name for name, key in keys.items() if not stored.fresh(f"{of}{name}", key)]

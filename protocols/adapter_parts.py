@@ -115,21 +115,8 @@ class StreamClock(StrictModel):
 
 
 Axis = Literal["taxel", "polarity", "step", "x", "y"]
-EventFormat = Literal[
-    "counts",
-    "csv",
-    "numpy",
-    "aedat4",
-    "dsec",
-    "lab-hdf5",
-    "raw",
-    "es",
-    "mcap",
-    "rosbag",
-    "lab-pickles",
-]
-SEVERAL_FILES = frozenset({"lab-pickles"})
-"""Formats of events of which a trial may have more than one file."""
+OWN_FORMATS = ("counts", "csv", "numpy")
+"""Formats of events that an adapter describes; others are those of `import`."""
 _COUNTS = ("axes", "step_ms", "polarity_order")
 _TABLES = ("columns", "unit", "positive")
 
@@ -152,9 +139,9 @@ class EventFiles(StrictModel):
 
     files: Pattern | None = None
     """Pattern of the file of a trial, found by the fields in it; by default the trial's file."""
-    format: EventFormat
+    format: Annotated[str, Field(min_length=1, max_length=100)]
     """``counts`` is an array of whole counts per time step, ``csv`` and ``numpy`` have an event a
-    row."""
+    row; others are the names of formats that `import` knows, those of plug-ins among them."""
     axes: tuple[Axis, ...] = ()
     """Of counts: meaning of the array's axes in their order, such as ``[taxel, polarity, step]``
     or ``[step, polarity, y, x]``."""

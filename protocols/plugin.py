@@ -41,6 +41,8 @@ class Plugin:
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
             drivers names them in the group of entry points `sliplab.drivers` instead.
         sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).
+        problems: by name, functions that return a problem (`analysis.problem.Problem`), or None,
+            given the labels of a store and some of its campaigns.
         searches: by name, functions that return a search of a study (`analysis.study_plan.Search`)
             or None, given the study's plan and its run requests.
         formats: formats of recordings (`storage.formats.format.Format`) by name.
@@ -55,6 +57,7 @@ class Plugin:
     detectors: Mapping[str, str] = field(default_factory=dict)
     drivers: Mapping[str, str] = field(default_factory=dict)
     sections: Mapping[str, str] = field(default_factory=dict)
+    problems: Mapping[str, str] = field(default_factory=dict)
     searches: Mapping[str, str] = field(default_factory=dict)
     formats: Mapping[str, str] = field(default_factory=dict)
     exports: Mapping[str, str] = field(default_factory=dict)

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from decimal import Decimal
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Self, TypeVar, get_args
 
@@ -233,13 +233,23 @@ _LEFT_OUT = object()
 """In place of a value that cannot be read."""
 
 
+@lru_cache(maxsize=32)
+def _composed(text: str) -> Any:
+    """Return the root node; the same file is read many times, by a plan, a campaign and a check."""
+    loader = _Loader(text)
+    try:
+        return loader.get_single_node()
+    finally:
+        loader.dispose()
+
+
 class _Builder:
     """Plain data from nodes, with the key of whatever is wrong."""
 
-    def __init__(self, loader: _Loader, path: str | Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         self.written: dict[str, str] = {}
         self.faults: list[InputError] = []
-        self._loader, self._path = loader, path
+        self._path, self._constructor = path, _Loader("")
 
     def build(self, node: Any, key: str) -> Any:
         """The data of a node; `key` is its location."""
@@ -302,14 +312,14 @@ class _Builder:
             if kind in {"str", "value", "merge"}:
                 return text
             if kind == "bool":
-                return self._loader.construct_yaml_bool(node)
+                return self._constructor.construct_yaml_bool(node)
             if kind == "int":
                 return int(text.replace("_", ""), 10)
             if kind == "float" and ":" not in text:
                 plain = text.replace("_", "").lower()
                 return Decimal(_SPECIAL.get(plain, plain))
             if kind == "timestamp":
-                return self._loader.construct_yaml_timestamp(node)
+                return self._constructor.construct_yaml_timestamp(node)
         except (ValueError, ArithmeticError, LookupError, AttributeError):
             pass
         if kind == "timestamp":
@@ -416,14 +426,10 @@ def parse_leniently(text: str, path: str | Path) -> YamlDocument:
     Raises:
         InputError: not YAML, not a mapping, nested too deep.
     """
+    builder = _Builder(path)
     try:
-        loader = _Loader(text)
-        builder = _Builder(loader, path)
-        try:
-            node = loader.get_single_node()
-            data = None if node is None else builder.build(node, "")
-        finally:
-            loader.dispose()
+        node = _composed(text)
+        data = None if node is None else builder.build(node, "")
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}"
@@ -440,12 +446,7 @@ def parse_leniently(text: str, path: str | Path) -> YamlDocument:
 
 def mask_secrets(text: str) -> str:
     """YAML text with the values of secret keys masked, at any depth; the rest stays unchanged."""
-    loader = _Loader(text)
-    try:
-        root = loader.get_single_node()
-    finally:
-        loader.dispose()
-    found = sorted(_secret_values(root), key=lambda node: -node.start_mark.index)
+    found = sorted(_secret_values(_composed(text)), key=lambda node: -node.start_mark.index)
     for node in found:
         begin, end = node.start_mark.index, node.end_mark.index
         line_end = "\n" if text[begin:end].endswith("\n") else ""

@@ -26,7 +26,7 @@ from sliplab.rigs.core.driver import (
     ForceSensorDriver,
     FrameCameraDriver,
     RigDriver,
-    ScalarSensorDriver,
+    SensorDriver,
 )
 from sliplab.rigs.core.guard import Guard, PlateLimits
 from sliplab.rigs.core.host_clock import HostClock
@@ -41,6 +41,7 @@ from sliplab.rigs.stream_settings import (
     EventStream,
     ForceStream,
     FrameStream,
+    SensorStream,
     Stream,
 )
 from sliplab.storage.schema.trial import StreamRecord
@@ -190,7 +191,7 @@ def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> Dev
         device = driver.build(settings, stream.scale_px_per_mm)
     elif isinstance(driver, ForceSensorDriver):
         device = driver.build(settings, arm)
-    elif isinstance(driver, ScalarSensorDriver):
+    elif isinstance(driver, SensorDriver):
         device = driver.build(settings)
     assert device is not None  # the rig file was checked against its driver
     with ExitStack() as undo:
@@ -232,6 +233,8 @@ def further_stream(name: str, stream: Stream, device: Any, plate: PlateFrame) ->
             raise RigError(f"{name} (force sensor)", text)
         matrix = plate.force_matrix(device.mounting)
         return DeviceStream(name, device, StreamRecord(**stated, to_plate=matrix))
+    if isinstance(stream, SensorStream):
+        return DeviceStream(name, device, StreamRecord(**stated))
     if device.unit != stream.unit:
         text = f"reads in {device.unit}, and the rig file says streams.{name}.unit: {stream.unit}"
         raise RigError(f"{name} (scalar sensor)", text)

@@ -173,11 +173,6 @@ class DeviceSettings(RigSection):
         driver = self.gripper_driver
         return None if driver is None else driver.range(self.gripper)
 
-    @property
-    def grip_opening_mm(self) -> float | None:
-        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        return None if self.gripper is None else self.gripper.opening_mm
-
     def plan_faults(self, plan: Plan, file: str) -> Iterator[InputError]:
         """Check that the arm can twist, if the plan does."""
         driver = self.arm_driver

@@ -237,10 +237,6 @@ class RigFile(StrictModel):
             if not low <= wanted.force <= high:
                 text = f"must be from {low:g} to {high:g} N, which the gripper can be set to"
                 yield KeyedError("reflex.force", f"{wanted.force} N", text)
-        block_ms = 0 if self.mock is None else self.mock.block_ms
-        if wanted.stream_timeout * 1000 <= block_ms:
-            text = f"must be over {block_ms} ms, the camera's blocks"
-            yield KeyedError("reflex.stream_timeout", f"{wanted.stream_timeout} s", text)
 
     @rule
     def _poll_is_short(self) -> Iterator[KeyedError]:
@@ -302,7 +298,8 @@ class RigFile(StrictModel):
     @property
     def grip_opening_mm(self) -> float | None:
         """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        return None if self._driven is None else self._driven.grip_opening_mm
+        gripper = getattr(self._driven, "gripper", None)
+        return None if gripper is None else gripper.opening_mm
 
     def drivers(self) -> Iterator[tuple[str, Driver[Any], Any]]:
         """Return the part in the rig, driver and settings of every device, the arm first."""

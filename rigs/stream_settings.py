@@ -34,9 +34,9 @@ from sliplab.rigs.core.driver import (
     EventCameraDriver,
     ForceSensorDriver,
     FrameCameraDriver,
-    ScalarSensorDriver,
+    SensorDriver,
 )
-from sliplab.rigs.core.registry import find_driver
+from sliplab.rigs.core.registry import drivers, find_driver
 from sliplab.rigs.core.sections import SimulatedStream
 from sliplab.rigs.device_section import DeviceSettings, OfKind, Simulated
 
@@ -94,6 +94,14 @@ class _StreamSettings(StrictModel):
         if mock is not None:
             yield from mock.stream_faults(self)
 
+    @rule
+    def _driver_sends_it(self) -> Self:
+        driver, kind = self.driver, getattr(self, "kind", "")
+        if isinstance(driver, SensorDriver) and driver.sends != kind:
+            text = f"must be {driver.sends}, which the driver {driver.name} sends"
+            raise KeyedError(".kind", kind, text)
+        return self
+
     @property
     def driver(self) -> Driver[Any] | None:
         """The driver of the device; None on a mock rig."""
@@ -146,12 +154,12 @@ class ScalarStream(_StreamSettings):
     """A sensor of one quantity, such as a temperature; its readings are timed by arrival."""
 
     GRADES = ("host arrival",)
-    DRIVERS = ScalarSensorDriver
+    DRIVERS = SensorDriver
 
     kind: Literal["scalar"]
     unit: str = Field(min_length=1, max_length=20)
     """Unit of the readings, such as `degC`."""
-    device: Annotated[DriverSettings, OfKind(ScalarSensorDriver)] | None = None
+    device: Annotated[DriverSettings, OfKind(SensorDriver)] | None = None
     mock: Annotated[SimulatedStream, Simulated("scalar")] | None = None
 
     @field_validator("unit")
@@ -175,7 +183,18 @@ class ForceStream(_StreamSettings):
     """The simulated sensor, which feels the same load as the first one."""
 
 
-Stream = EventStream | FrameStream | ForceStream | ScalarStream
+class SensorStream(_StreamSettings):
+    """A sensor of a kind that another package declares; timed by arrival, on real rigs."""
+
+    GRADES = ("host arrival", "host time")
+    DRIVERS = SensorDriver
+
+    kind: str
+    device: Annotated[DriverSettings, OfKind(SensorDriver)] | None = None
+    mock: None = None
+
+
+Stream = EventStream | FrameStream | ForceStream | ScalarStream | SensorStream
 KINDS: dict[str, type[Stream]] = {
     "events": EventStream,
     "frames": FrameStream,
@@ -190,6 +209,8 @@ class _ByKind(ChosenModel):
     def choose(self, value: dict[str, Any]) -> type[Stream]:
         """Return the model of the kind that `value` names."""
         kind = value.get("kind")
+        if kind not in KINDS and kind in {driver.sends for driver in drivers(SensorDriver)}:
+            return SensorStream
         if not isinstance(kind, str) or kind not in KINDS:
             hint = did_you_mean(str(kind), KINDS) if kind is not None else ""
             raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}{hint}")

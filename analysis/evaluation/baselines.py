@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected, agreeing, class_names
+from sliplab.analysis.campaigns import Collected, agreeing
 from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.evaluation.classes import NAME as CLASSES
 from sliplab.analysis.metrics import classification as metrics
@@ -108,10 +108,9 @@ def slip_methods() -> Methods:
     return Methods(NAMES)
 
 
-def class_methods(campaigns: list[Collected]) -> Methods:
+def class_methods(campaigns: list[Collected], classes: int) -> Methods:
     """Return the methods on windows of recordings of classes; of taxels there is no frame."""
     windows = agreeing(campaigns)[0].settings.windows
-    classes = len(class_names(campaigns))
     kinds = KINDS if windows.taxels is None else TAXEL_KINDS
     nets = {kind: [CLASS_EPOCHS, CLASS_BATCH, *SEEDS] for kind in kinds}
     names = {"boosting": [ROUNDS, classes], **nets}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected, agreeing, class_names
+from sliplab.analysis.campaigns import Collected, agreeing
 from sliplab.analysis.evaluation.evaluation import STEP
 from sliplab.analysis.evaluation.windows import NAME as WINDOWS_NAME
 from sliplab.analysis.evaluation.windows import STEP as WINDOWS
@@ -26,7 +26,7 @@ from sliplab.analysis.networks.baselines import (
     logistic_cells,
     logistic_slices,
 )
-from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_class_models
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX, TrialRef, by_id
@@ -65,13 +65,17 @@ class ClassJob:
     key: str
 
 
-def make_class_job(labels: StoreLabels, campaigns: list[Collected]) -> ClassJob:
+def make_class_job(
+    labels: StoreLabels,
+    campaigns: list[Collected],
+    classes: tuple[str, ...],
+    models: list[ModelOnDisk],
+) -> ClassJob:
     """Find the inputs of the evaluation.
 
     Raises:
         StoreError: a model or a label is missing or stale.
     """
-    models = wanted_class_models(labels.store, campaigns, labels.reviewed)
     model = choose_model(models)
     inputs = [
         [item.name, trial.id, labels.key(item, recording)]
@@ -82,7 +86,7 @@ def make_class_job(labels: StoreLabels, campaigns: list[Collected]) -> ClassJob:
     of_review = [] if states is None else [states]
     keys = [each.key for each in models]
     key = make_key("evaluate classes", VERSION, [keys, model.key, inputs, *of_review], None)
-    return ClassJob(labels, campaigns, class_names(campaigns), models, model, key)
+    return ClassJob(labels, campaigns, classes, models, model, key)
 
 
 def class_evaluation_of(store: Store) -> ClassEvaluation:

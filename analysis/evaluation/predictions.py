@@ -55,7 +55,7 @@ _SHOWN = 3
 
 
 @dataclass(frozen=True)
-class Predicted(Judgement):
+class PredictionJudgement(Judgement):
     """Predictions that fit the store's test windows.
 
     Attributes:
@@ -102,13 +102,13 @@ def read_predictions(path: Path) -> pd.DataFrame:
     raise InputError(path, "", None, "must be a table of predictions, .csv or .parquet")
 
 
-def predicted(
+def prediction_judgement(
     labels: StoreLabels,
     campaigns: list[Collected],
     source: Path | pd.DataFrame,
     margin: float | None = None,
     smoothing: int | None = None,
-) -> Predicted:
+) -> PredictionJudgement:
     """Return predictions as something to judge, after all checks.
 
     Args:
@@ -150,7 +150,7 @@ def predicted(
         exact=True,
     )
     judgement = file_judgement(labels, campaigns, network, margin, smoothing)
-    return Predicted(**vars(judgement), outputs=outputs, scale=_SCALE[kind])
+    return PredictionJudgement(**vars(judgement), outputs=outputs, scale=_SCALE[kind])
 
 
 def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:

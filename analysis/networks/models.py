@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
+from sliplab.analysis.campaigns import Collected, agreeing, training_campaigns
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
@@ -92,7 +92,7 @@ def wanted_models(
         StoreError: a trial has no fresh label yet.
     """
     used = training_campaigns(campaigns)
-    return _models(store, used, used[0].settings, reviewed, "")
+    return _models(StoreLabels(store, reviewed), used, used[0].settings, "")
 
 
 def comparison_models(
@@ -102,34 +102,33 @@ def comparison_models(
     settings = training_settings(campaigns).comparison_settings()
     if settings is None:
         return []
-    return _models(store, training_campaigns(campaigns), settings, reviewed, f"{settings.preset}-")
+    labels, used = StoreLabels(store, reviewed), training_campaigns(campaigns)
+    return _models(labels, used, settings, f"{settings.preset}-")
 
 
 def wanted_class_models(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
+    labels: StoreLabels, campaigns: list[Collected], classes: tuple[str, ...]
 ) -> list[ModelOnDisk]:
     """The models of recordings that show classes; see `wanted_models`.
 
     Raises:
-        StoreError: a trial has no fresh label yet, or there are fewer than two classes.
+        StoreError: a trial has no fresh label yet.
         InputError: the campaigns' windows differ.
     """
-    used, classes = agreeing(campaigns), class_names(campaigns)
+    used = agreeing(campaigns)
     for item in used:
         item.need("events", "the network is trained on windows of them")
-    return _models(store, used, used[0].settings, reviewed, CLASS_PREFIX, classes)
+    return _models(labels, used, used[0].settings, CLASS_PREFIX, classes)
 
 
 def _models(
-    store: Store,
+    labels: StoreLabels,
     used: list[Collected],
     settings: AnalysisSettings,
-    reviewed: bool,
     prefix: str,
     classes: tuple[str, ...] = (),
 ) -> list[ModelOnDisk]:
     inputs = []
-    labels = StoreLabels(store, reviewed)
     for item in used:
         for trial, recording in item.trials:
             if not labels.fresh(item, recording):
@@ -154,7 +153,7 @@ def _models(
             inputs,
             {**parameters, "seed": seed, "dataset": dataset.VERSION},
         )
-        path = store.folder / "models" / f"{prefix}seed{seed}.pt"
+        path = labels.store.folder / "models" / f"{prefix}seed{seed}.pt"
         models.append(ModelOnDisk(seed, path, key, settings, classes))
     return models
 

@@ -1,16 +1,17 @@
-"""Comparison of two reports: differences, their significance, and the page.
+"""Comparison of two reports: the difference of their tables of scores, and the page.
 
 A difference alone says nothing: another seed, or other trials, would have changed the figure
 as well. So each difference is compared with its expected random variation: the spread between seeds
 if several were trained, otherwise that between trials, paired if both reports evaluated the same
-trials. Both summaries contain all inputs.
+trials. Both tables contain all inputs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,17 +20,18 @@ import numpy.typing as npt
 
 from sliplab.analysis.metrics.intervals import (
     STATISTICS,
+    Span,
     between_seeds,
     difference,
     share_difference,
 )
 from sliplab.analysis.report.figures.intervals import differences
-from sliplab.analysis.report.outcomes import is_lost, lost_ms
 from sliplab.analysis.report.page import Figure, Number, Table, render_page
+from sliplab.analysis.report.scores import Row, score_rows
 from sliplab.protocols.errors import InputError
-from sliplab.storage.schema.document import DocumentError, NewerFormat
-from sliplab.storage.schema.evaluation import SeedTimes, Share
-from sliplab.storage.schema.summary import Experiment, Kinematic, Summary, TrialOutcome
+from sliplab.storage.schema.classes import ClassSummary
+from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
+from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
 
 Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
@@ -54,20 +56,57 @@ COLUMNS = (
 )
 TERMINAL = ("figure", "here", "there", "difference", "more than noise?")
 _TIMES = {
-    "latency_incipient_ms": "incipient latency",
-    "latency_gross_ms": "gross latency",
-    "lead_ms": "lead",
+    "latency_incipient_ms": ("latency_ms.incipient.median", "incipient latency"),
+    "latency_gross_ms": ("latency_ms.gross.median", "gross latency"),
+    "lead_ms": ("lead_ms.median", "lead"),
 }
-_STATISTICS = {"mean": "mean", "median": "median", "p95": "95th percentile"}
-_SHARES = (
-    ("outcome", "detected_first", "detected before gross slip"),
-    ("outcome", "false_early", "incipient false early"),
-    ("outcome", "missed", "incipient missed"),
-    ("outcome", "late", "incipient late"),
-    ("gross", "false_early", "gross false early"),
-    ("gross", "missed", "gross missed"),
-    ("gross", "late", "gross late"),
+_WORDS = {"mean": "mean", "median": "median", "p95": "95th percentile"}
+_WINDOWS = (
+    ("seeds.each.strict", "accuracy, strict", "seeds"),
+    ("seeds.each.argmax", "accuracy, argmax", "seeds"),
+    ("seeds.each.margin", "accuracy, margin", "seeds"),
+    ("by_trial.strict", "accuracy, strict", "windows"),
+    ("interval", "accuracy, strict", "intervals"),
+    ("window_intervals.accuracy", "accuracy, argmax", "intervals"),
+    ("window_intervals.incipient_precision", "incipient precision", "intervals"),
+    ("window_intervals.incipient_recall", "incipient recall", "intervals"),
+    ("trials.strict", "accuracy on recordings, strict", "intervals"),
+    ("trials.argmax", "accuracy on recordings, argmax", "intervals"),
+    ("work.synaptic_operations.all", "synaptic operations a window", "none"),
 )
+_TRIALS = (
+    *((f"by_seed.{median}", f"{title}, median", "seeds") for median, title in _TIMES.values()),
+    *(
+        (figure, f"{title}, {word}", statistic)
+        for figure, (_, title) in _TIMES.items()
+        for statistic, word in _WORDS.items()
+    ),
+    ("lead_ms.min", "lead, smallest", "none"),
+    ("outcome.detected_first", "detected before gross slip", "mean"),
+    *(
+        (f"{key}.{name}", f"{onset} {name.replace('_', ' ')}", "mean")
+        for key, onset in (("outcome", "incipient"), ("gross", "gross"))
+        for name in ("false_early", "missed", "late")
+    ),
+)
+_TRUTH = "median distance from the truth"
+_OTHERS = (
+    ("labels.error_ms.incipient.median_abs", f"labels: incipient, {_TRUTH}", "none"),
+    ("labels.error_ms.gross.median_abs", f"labels: gross, {_TRUTH}", "none"),
+    ("sync.worst_uncertainty_us", "clocks: worst uncertainty", "none"),
+    ("quality.committed", "trials committed", "none"),
+    ("quality.retaken", "attempts taken again", "none"),
+)
+FIGURES = (
+    ("kinematic", "", _WINDOWS),
+    ("classes", "", _WINDOWS),
+    *((name, f"{name}: ", _TRIALS) for name in ("kinematic", "gravity", "disturbance")),
+    ("", "", _OTHERS),
+)
+"""Figures that are compared, by experiment, with what their titles begin with. Of each: its name in
+the table of scores, its title, and the statistic over its rows, or the source of its noise. Of two
+with the same title the first one that both reports have is compared."""
+_SETTINGS = ("simulated", "protocols", "detection", "seeds", "versions")
 
 
 @dataclass(frozen=True)
@@ -91,22 +130,6 @@ class Change:
     high: float | None
     basis: Basis
     beyond: bool | None
-
-    @staticmethod
-    def of(
-        name: str,
-        unit: str,
-        here: float,
-        there: float,
-        span: tuple[float, float] | None,
-        basis: Basis,
-    ) -> Change:
-        """Compare a difference with its interval; without one, its noise is unknown."""
-        gap = here - there
-        if span is None:
-            return Change(name, unit, here, there, gap, None, None, "none", None)
-        beyond = not span[0] <= 0 <= span[1]
-        return Change(name, unit, here, there, gap, *span, basis, beyond)
 
 
 @dataclass(frozen=True)
@@ -139,247 +162,158 @@ class ReportComparison:
         }
 
 
-_OTHERS = {
-    "one_camera": "is a report on a rig with one camera, without a spiking network to compare",
-    "classes": "is a report on recordings of classes; only reports on slip are compared",
-}
-"""Summaries that are not compared, each by a key that only it has."""
-
-
-def load_other(place: Path) -> Summary:
-    """Read the summary of another report.
+def load_report(place: Path, option: str = "--against") -> Document:
+    """Read the summary of a report of any kind.
 
     Args:
         place: a store that has one, or a ``summary.json``.
+        option: that named it.
 
     Raises:
-        InputError: it does not exist, or has another version.
+        InputError: it does not exist, is damaged, or has another version.
     """
     path = place.joinpath(*SUMMARY) if place.is_dir() else place
-    try:
-        return Summary.load(path)
-    except OSError as error:
-        why = f"must be a store with a report, or its report/summary.json ({error})"
-    except DocumentError as error:
-        why = f"lacks what is compared ({error}); run `sliplab report` on it with this version"
-        why = not_compared(path) or why
-    except NewerFormat as error:
-        why = str(error)
-    raise InputError("--against", "", str(place), why) from None
+    why = ""
+    for kind in (Summary, OneCameraSummary, ClassSummary):
+        try:
+            return kind.load(path)
+        except OSError as error:
+            why = f"must be a store with a report, or its report/summary.json ({error})"
+        except DocumentError as error:
+            again = "run `sliplab report` on it with this version"
+            why = why or f"lacks what is compared ({error}); {again}"
+        except NewerFormat as error:
+            why = str(error)
+    raise InputError(option, "", str(place), why)
 
 
-def not_compared(path: Path) -> str | None:
-    """Return why the summary in a file is not compared with others; None where it is."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return next((why for key, why in _OTHERS.items() if f'"{key}":' in text), None)
+def compare(here: Document, there: Document) -> ReportComparison:
+    """Compare the figures that both reports have."""
+    both = here.to_json(), there.to_json()
+    tables = [_by_figure(summary) for summary in both]
+    found: dict[str, Change] = {}
+    for experiment, beginning, figures in FIGURES:
+        who = ""
+        for figure, words, how in figures:
+            ours, theirs = (table.get((experiment, figure), ()) for table in tables)
+            name = beginning + words + (", mean of seeds" if how == "seeds" else who)
+            if not ours or not theirs or name in found:
+                continue
+            if how in BASES:
+                change = _of_figures(name, ours, theirs, how)
+            else:
+                change = _of_trials(name, ours, theirs, how, _same_trials(ours, theirs, *both))
+            if change is not None:
+                found[name] = change
+                who = ", the chosen network" if how == "seeds" else who
+    simulated = bool(both[0]["simulated"]), bool(both[1]["simulated"])
+    return ReportComparison(list(found.values()), _settings(*both), simulated)
 
 
-def compare(here: Summary, there: Summary) -> ReportComparison:
-    """Compare both reports figure by figure."""
-    changes = _windows(here, there)
-    for experiment in ("kinematic", "gravity", "disturbance"):
-        changes += _of_trials(here, there, experiment)
-    changes += _plain(here, there)
-    return ReportComparison(changes, _settings(here, there), (here.simulated, there.simulated))
+Rows = Sequence[Row]
 
 
-def _settings(here: Summary, there: Summary) -> list[ReportDifference]:
-    rows = []
-    parts = [here.to_json(), there.to_json()]
-    for name in ("simulated", "protocols", "detection", "seeds", "versions"):
-        ours, theirs = (_flat(part.get(name), name) for part in parts)
-        rows += [
-            ReportDifference(what, ours.get(what), theirs.get(what))
-            for what in dict.fromkeys([*ours, *theirs])
-            if ours.get(what) != theirs.get(what)
-        ]
-    return rows
+def _by_figure(summary: Json) -> Mapping[tuple[str, str], Rows]:
+    """Return the rows of the report's own network by experiment and figure.
 
-
-def _flat(value: object, name: str) -> dict[str, object]:
-    """Return the leaves of mappings in each other by dotted names."""
-    if not isinstance(value, dict):
-        return {name: value}
-    parts = [_flat(inner, f"{name}.{key}") for key, inner in sorted(value.items())]
-    return {key: found for part in parts for key, found in part.items()}
-
-
-def _windows(here: Summary, there: Summary) -> list[Change]:
-    """Compare windows: by seeds where one report has several, else by intervals over trials."""
-    found = []
-    ours, theirs = here.kinematic, there.kinematic
-    for kind in ("strict", "argmax", "margin"):
-        a, b = ([getattr(row, kind) for row in part.seeds.each] for part in (ours, theirs))
-        if any(value is None for value in [*a, *b]) or not a or not b:
-            continue
-        noise = between_seeds(a, b)
-        if noise is not None:
-            name = f"accuracy, {kind}, mean of seeds"
-            found.append(_around(name, float(np.mean(a)), float(np.mean(b)), noise, "seeds"))
-    by_seeds = bool(found)
-    paired = _strict(ours, theirs) if _same_collection(here, there, "kinematic") else None
-    if paired is not None:
-        found.append(paired)
-    spans: list[dict[str, Share]] = [
-        {"strict": part.interval, **part.window_intervals} for part in (ours, theirs)
-    ]
-    names = {
-        "strict": "accuracy, strict",
-        "accuracy": "accuracy, argmax",
-        "incipient_precision": "incipient precision",
-        "incipient_recall": "incipient recall",
-    }
-    for key, name in names.items():
-        if key == "strict" and paired is not None:
-            continue
-        rows = [part[key] for part in spans if key in part]
-        known = [
-            (row.share, row.low, row.high)
-            for row in rows
-            if row.share is not None and row.low is not None and row.high is not None
-        ]
-        if len(known) == len(spans):
-            noise = math.hypot(*((high - low) / 2 for _, low, high in known))
-            mine, other = (float(share) for share, _, _ in known)
-            title = f"{name}, the chosen network" if by_seeds else name
-            found.append(_around(title, mine, other, noise, "intervals"))
+    A report of one seed has that seed's figures under the names of those of several.
+    """
+    found: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    for row in score_rows(summary):
+        if not row["detector"]:
+            found[row["experiment"], row["figure"]].append(row)
+    for experiment, figure in list(found):
+        found.setdefault((experiment, f"by_seed.{figure}"), found[experiment, figure])
     return found
 
 
-def _strict(ours: Kinematic, theirs: Kinematic) -> Change | None:
-    """Compare strict accuracy on the windows of the same trials; None where these are others."""
-    parts = [{(row.campaign, row.trial): row for row in part.by_trial} for part in (ours, theirs)]
-    order = sorted(parts[0])
-    if order != sorted(parts[1]) or not order:
-        return None
-    windows = [[float(part[key].n) for key in order] for part in parts]
-    hits = [[float(part[key].n - part[key].errors) for key in order] for part in parts]
-    span = share_difference((hits[0], windows[0]), (hits[1], windows[1]))
-    if span is None:
-        return None
-    a, b = (sum(hit) / sum(all_of) for hit, all_of in zip(hits, windows, strict=True))
-    return Change.of("accuracy, strict, the chosen network", "share", a, b, span, "same trials")
+def _same_trials(ours: Rows, theirs: Rows, here: Json, there: Json) -> bool:
+    """Check that trials were not only called the same, but collected by the same protocol."""
+    names = [{(row["campaign"], row["trial"]) for row in rows} for rows in (ours, theirs)]
+    hashes = [
+        {name: part["protocols"].get(name, {}).get("collection") for name, _ in names[0]}
+        for part in (here, there)
+    ]
+    return names[0] == names[1] and hashes[0] == hashes[1]
 
 
-def _around(
-    name: str, a: float, b: float, noise: float, basis: Basis, unit: str = "share"
+def _of_trials(name: str, ours: Rows, theirs: Rows, statistic: str, same: bool) -> Change | None:
+    """Compare a statistic over trials; of windows only over the same trials."""
+    basis: Basis = "same trials" if same else "trials"
+    if same:
+        there = {(row["campaign"], row["trial"]): row for row in theirs}
+        theirs = [there[row["campaign"], row["trial"]] for row in ours]
+    a, b = _values(ours), _values(theirs)
+    if statistic == "windows":
+        n, m = (np.array([row["n"] for row in rows], np.float64) for rows in (ours, theirs))
+        span = share_difference((a * n, n), (b * m, m)) if same else None
+        if span is None:
+            return None
+        return _changed(name, ours, (a @ n / n.sum(), b @ m / m.sum()), span, basis)
+    if statistic != "median":  # a lost detection has a rank, but no size
+        a, b = (np.where(np.isinf(values), np.nan, values) for values in (a, b))
+    if not np.isfinite(a).any() or not np.isfinite(b).any():
+        return None
+    both = [float(STATISTICS[statistic](values, axis=0)) for values in (a, b)]
+    if not np.isfinite(both).all() or (ours[0]["unit"] == "share" and not any(both)):
+        return None
+    return _changed(name, ours, both, difference(a, b, statistic, paired=same), basis)
+
+
+def _of_figures(name: str, ours: Rows, theirs: Rows, how: str) -> Change | None:
+    """Compare figures over all trials, of every trained seed or of one."""
+    a, b = _values(ours), _values(theirs)
+    if not np.isfinite([*a, *b]).all():
+        return None
+    both = [float(values.mean()) for values in (a, b)]
+    if how == "none":
+        return _changed(name, ours, both, None, "none")
+    basis: Basis = "seeds" if how == "seeds" else "intervals"
+    if basis == "seeds":
+        noise = between_seeds(a, b)
+    else:
+        noise = math.hypot(*((of[0]["high"] - of[0]["low"]) / 2 for of in (ours, theirs)))
+    if noise is None or not math.isfinite(noise):
+        return None
+    gap = both[0] - both[1]
+    return _changed(name, ours, both, (gap - noise, gap + noise), basis)
+
+
+def _values(rows: Rows) -> npt.NDArray[np.float64]:
+    return np.array([row["value"] for row in rows], np.float64)
+
+
+def _changed(
+    name: str, rows: Rows, both: Sequence[float], span: Span | None, basis: Basis
 ) -> Change:
-    return Change.of(name, unit, a, b, (a - b - noise, a - b + noise), basis)
+    """Compare a difference with its interval; without one, its noise is unknown."""
+    here, there = map(float, both)
+    unit, gap = str(rows[0]["unit"]), here - there
+    if span is None:
+        return Change(name, unit, here, there, gap, None, None, "none", None if gap else False)
+    return Change(name, unit, here, there, gap, *span, basis, not span[0] <= 0 <= span[1])
 
 
-def _of_trials(here: Summary, there: Summary, experiment: str) -> list[Change]:
-    """Compare latencies, leads and shares of an experiment, by its trials."""
+def _settings(here: Json, there: Json) -> list[ReportDifference]:
+    """Return the settings in which two summaries differ."""
     ours, theirs = (
-        {(row.campaign, row.trial): row for row in part.trials if row.experiment == experiment}
+        dict(leaf for name in _SETTINGS for leaf in _leaves(name, part.get(name)))
         for part in (here, there)
     )
-    if not ours or not theirs:
-        return []
-    same = ours.keys() == theirs.keys() and _same_collection(here, there, experiment)
-    rows = [list(ours.values()), [theirs[key] for key in ours] if same else list(theirs.values())]
-    found = _of_seeds(getattr(here, experiment), getattr(there, experiment), experiment)
-    who = ", the chosen network" if found else ""
-    for key, title in _TIMES.items():
-
-        def time(row: TrialOutcome, key: str = key) -> float:
-            value = getattr(row, key)
-            return math.nan if value is None else float(value)
-
-        def with_lost(row: TrialOutcome, key: str = key) -> float:
-            return lost_ms(key) if is_lost(row, key) else time(row, key)
-
-        for statistic, word in _STATISTICS.items():
-            name = f"{experiment}: {title}, {word}{who}"
-            value = with_lost if statistic == "median" else time
-            found += _measured(name, "ms", rows, value, statistic, same)
-    for entry, outcome, title in _SHARES:
-
-        def hit(row: TrialOutcome, entry: str = entry, outcome: str = outcome) -> float:
-            return float(getattr(row, entry) == outcome)
-
-        if any(hit(row) for of in rows for row in of):
-            found += _measured(f"{experiment}: {title}{who}", "share", rows, hit, "mean", same)
-    return found
-
-
-def _of_seeds(ours: Experiment, theirs: Experiment, experiment: str) -> list[Change]:
-    """Compare median times of all trained networks; nothing where both reports have one."""
-    found = []
-    for key, title in _TIMES.items():
-        a, b = ([_median(it, key) for it in part.by_seed or (part,)] for part in (ours, theirs))
-        mine, other = ([value for value in each if value is not None] for each in (a, b))
-        if len(mine) < len(a) or len(other) < len(b):
-            continue
-        noise = between_seeds(mine, other)
-        if noise is not None:
-            name = f"{experiment}: {title}, median, mean of seeds"
-            means = float(np.mean(mine)), float(np.mean(other))
-            found.append(_around(name, *means, noise, "seeds", "ms"))
-    return found
-
-
-def _median(times: SeedTimes | Experiment, key: str) -> float | None:
-    """Return the median of a time of `_TIMES`."""
-    of = {
-        "latency_incipient_ms": times.latency_ms.incipient,
-        "latency_gross_ms": times.latency_ms.gross,
-        "lead_ms": times.lead_ms,
-    }
-    return of[key].median
-
-
-def _same_collection(here: Summary, there: Summary, experiment: str) -> bool:
-    """Check that trials were not only called the same, but collected by the same protocol."""
-    names = sorted({row.campaign for row in here.trials if row.experiment == experiment})
-    hashes = [
-        [of.collection if (of := part.protocols.get(name)) else None for name in names]
-        for part in (here, there)
+    return [
+        ReportDifference(what, ours.get(what), theirs.get(what))
+        for what in dict.fromkeys([*ours, *theirs])
+        if ours.get(what) != theirs.get(what)
     ]
-    return hashes[0] == hashes[1]
 
 
-def _measured(
-    name: str,
-    unit: str,
-    rows: Sequence[Sequence[TrialOutcome]],
-    value: Callable[[TrialOutcome], float],
-    statistic: str,
-    same: bool,
-) -> list[Change]:
-    """Compare a figure of trials; nothing where a report has no value of it."""
-    a, b = (np.array([value(row) for row in of], np.float64) for of in rows)
-    if not np.isfinite(a).any() or not np.isfinite(b).any():
-        return []
-    measure: Callable[..., npt.NDArray[np.float64]] = STATISTICS[statistic]
-    ours, theirs = float(measure(a, axis=0)), float(measure(b, axis=0))
-    if not math.isfinite(ours) or not math.isfinite(theirs):
-        return []
-    span = difference(a, b, statistic, paired=same)
-    return [Change.of(name, unit, ours, theirs, span, "same trials" if same else "trials")]
-
-
-def _plain(here: Summary, there: Summary) -> list[Change]:
-    """Compare figures of which no noise is known."""
-
-    def rows(of: Summary) -> Iterable[tuple[str, str, float | None]]:
-        errors, work = of.labels.error_ms, of.kinematic.work
-        operations = None if work is None else work.synaptic_operations.get("all")
-        truth = "median distance from the truth"
-        yield "gravity: lead, smallest", "ms", of.gravity.lead_ms.min
-        yield "disturbance: lead, smallest", "ms", of.disturbance.lead_ms.min
-        yield f"labels: incipient, {truth}", "ms", errors.incipient.median_abs
-        yield f"labels: gross, {truth}", "ms", errors.gross.median_abs
-        yield "clocks: worst uncertainty", "µs", of.sync.worst_uncertainty_us
-        yield "synaptic operations a window", "", operations
-        yield "trials committed", "", of.quality.committed
-        yield "attempts taken again", "", of.quality.retaken
-
-    found = []
-    for (name, unit, a), (_, _, b) in zip(rows(here), rows(there), strict=True):
-        if a is not None and b is not None:
-            change = Change.of(name, unit, float(a), float(b), None, "none")
-            found.append(replace(change, beyond=None if a != b else False))
-    return found
+def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
+    """Yield the leaves of mappings in each other by dotted names."""
+    if not isinstance(value, dict):
+        yield name, value
+        return
+    for key, inner in sorted(value.items()):
+        yield from _leaves(f"{name}.{key}", inner)
 
 
 def render(compared: ReportComparison, here: Path, there: Path) -> str:

@@ -13,7 +13,7 @@ from sliplab.analysis.campaigns import Collected, agreeing
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.evaluation.classes import SPLITS, class_evaluation_of
 from sliplab.analysis.networks import model_file
-from sliplab.analysis.networks.models import choose_model, wanted_class_models
+from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report.figures import classes as figures
 from sliplab.analysis.report.figures import intervals
@@ -77,7 +77,7 @@ def class_report_key(store: Store, campaigns: list[Collected]) -> str:
     inputs = [
         evaluation.key,
         collected,
-        baselines.class_methods(campaigns).fresh_keys(store),
+        baselines.class_methods(campaigns, len(evaluation.scores.classes)).fresh_keys(store),
         place,
     ]
     return make_key("report, classes", VERSION, inputs, None)
@@ -94,12 +94,13 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
         StoreError: there is no evaluation of this version yet.
     """
     evaluation = class_evaluation_of(store)
+    methods = baselines.class_methods(campaigns, len(evaluation.scores.classes))
     return ClassSummary(
         simulated=store.simulated,
         classes=JudgedClasses.model_validate(
             {
                 **evaluation.scores.to_json(),
-                "trained_baselines": baselines.class_methods(campaigns).results(store),
+                "trained_baselines": methods.results(store),
             }
         ),
         data={item.name: _origin(item) for item in campaigns},
@@ -497,11 +498,10 @@ def _made_section(
 
 
 def class_sections(
-    store: Store, campaigns: list[Collected], summary: ClassSummary
+    store: Store, campaigns: list[Collected], summary: ClassSummary, model: ModelOnDisk
 ) -> list[Content]:
     """Make all sections, in order."""
-    models = wanted_class_models(store, campaigns, summary.reviewed is not None)
-    fitted = model_file.load(choose_model(models).path)
+    fitted = model_file.load(model.path)
     sections = [
         _data_section(campaigns, summary),
         _network_section(summary, fitted),

@@ -12,7 +12,15 @@ from sliplab.analysis.metrics.intervals import difference, exact_interval, inter
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.intervals import Panel, by_condition
 from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
-from sliplab.analysis.report.outcomes import LEAST, OUTCOMES, TIMES, WORDS, Conditions, times
+from sliplab.analysis.report.outcomes import (
+    CAUSE,
+    LEAST,
+    OUTCOMES,
+    TIMES,
+    WORDS,
+    Conditions,
+    times,
+)
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
@@ -48,8 +56,6 @@ STATISTICS = {
     "late": "late",
     "false_early": "false early",
 }
-_CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
-"""Entry of a trial that gives the reason for a missing time."""
 _SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_onsets": "no onset"}
 
 
@@ -254,9 +260,9 @@ def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:
     if not rows:
         return "no trial"
     without = [row for row in rows if getattr(row, time) is None]
-    if time not in _CAUSE:
+    if time not in CAUSE:
         return f"{len(without)} without onset" if without else ""
-    causes = [getattr(row, _CAUSE[time]) for row in without]
+    causes = [getattr(row, CAUSE[time]) for row in without]
     return ", ".join(f"{causes.count(k)} {word}" for k, word in _SHORT.items() if k in causes)
 
 

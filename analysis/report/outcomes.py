@@ -11,7 +11,7 @@ import itertools
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -43,6 +43,8 @@ WORDS = {
 }
 TIMES = ("duration_ms", "latency_incipient_ms", "latency_gross_ms", "lead_ms")
 """Times of a trial."""
+CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
+"""Key of a trial that gives the reason for a missing time."""
 LEAST = {name: 0.0 if name in ("duration_ms", "lead_ms") else -math.inf for name in TIMES}
 """The least that each can be, ms; latencies reach below zero by the tolerance."""
 
@@ -113,21 +115,21 @@ def trial_intervals(
         there = times(trials, name)
         least = max(LEAST[name], -early_ms)
         spans: dict[str, Span] = {kind: interval(there, kind, least) for kind in ("mean", "p95")}
-        lost = sum(is_lost(row, name) for row in trials)
-        spans["median"] = median_span(there, lost, lost_ms(name), least)
+        lost = [value for row in trials if (value := lost_ms(vars(row), name)) is not None]
+        spans["median"] = median_span(there, len(lost), min(lost, default=math.inf), least)
         found[name] = TimeIntervals(n=len(there), **spans)
     return TrialIntervals(**found)
 
 
-def is_lost(row: TrialOutcome, name: str) -> bool:
-    """Return whether the detection behind one of `TIMES` was missed or late."""
-    if name == "duration_ms":
-        return False
-    return (row.gross if name == "latency_gross_ms" else row.outcome) in ("missed", "late")
+def lost_ms(trial: Mapping[str, Any], name: str) -> float | None:
+    """Return a lost detection's time in a median: infinitely late, or no lead; None of another.
 
-
-def lost_ms(name: str) -> float:
-    """Return the value of a lost detection in a median: infinitely late, or no lead at all."""
+    Args:
+        trial: a `TrialOutcome` as a mapping.
+        name: of `TIMES`.
+    """
+    if trial.get(CAUSE.get(name, "")) not in ("missed", "late"):
+        return None
     return -math.inf if name == "lead_ms" else math.inf
 
 

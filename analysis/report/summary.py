@@ -32,6 +32,7 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.schema.summary import (
     Hashes,
+    Kinematic,
     PaperSettings,
     Planned,
     QualitySummary,
@@ -44,25 +45,6 @@ from sliplab.storage.versions import FIGURES, installed_versions
 
 Slips = Mapping[tuple[str, str], References]
 """Slips of trials by each onset, by campaign and trial."""
-_WINDOWS = (
-    "accuracy",
-    "confusion",
-    "precision",
-    "recall",
-    "baselines",
-    "samples",
-    "interval",
-    "seeds",
-    "reliability",
-    "calibration",
-    "by_factor",
-    "by_tenth",
-    "no_slip",
-    "by_trial",
-    "work",
-    "beside",
-)
-"""Keys that the summary takes over from the evaluation's windows; docs/metrics.md."""
 
 
 def package_versions() -> dict[str, str]:
@@ -156,7 +138,7 @@ def judged_part(
     judged = _judged(campaigns, evaluation, references)
     windows = evaluation.windows.to_json()
     kinematic = {
-        **{name: windows[name] for name in _WINDOWS},
+        **{name: value for name, value in windows.items() if name in Kinematic.model_fields},
         "trained_baselines": baselines,
         "window_intervals": {} if spans is None else spans.to_json(),
         "false_alarms": false_alarms(campaigns, evaluation.trials, programs, OWN),

@@ -78,10 +78,18 @@ def load_samples(
 
 
 def load_class_samples(
-    labels: StoreLabels, campaigns: list[Collected], split: str, each: EachTrial = in_order
+    labels: StoreLabels,
+    campaigns: list[Collected],
+    split: str,
+    each: EachTrial = in_order,
+    classes: tuple[str, ...] | None = None,
 ) -> SampleSet:
-    """Load the samples of all trials of one split of campaigns of classes; see `load_samples`."""
-    return _load(labels, agreeing(campaigns), split, each, class_names(campaigns))
+    """Load the samples of all trials of one split of campaigns of classes; see `load_samples`.
+
+    Args:
+        classes: names of the classes; by default those that the campaigns' adapters list.
+    """
+    return _load(labels, agreeing(campaigns), split, each, classes or class_names(campaigns))
 
 
 def _load(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from sliplab.flows.cli.common import DATA, JsonOption, StoreOption, finish
 from sliplab.flows.running import console, exit_codes
-from sliplab.storage.streams import Json
 
 app = typer.Typer()
 
@@ -84,7 +83,7 @@ def import_(
         raise typer.Exit(exit_codes.FAILED)
 
 
-def _show(result: Json, title: str, planned: str) -> None:
+def _show(result: dict[str, Any], title: str, planned: str) -> None:
     """Print the result of an import for a person; its faults were printed when they were found.
 
     Args:

@@ -34,7 +34,8 @@ class ExportOptions(StrictModel):
         default=None, description="Store: SPDX id of the licence, such as CC-BY-4.0."
     )
     stream: str | None = Field(
-        default=None, description="Trials: a further event camera's stream, by its name."
+        default=None,
+        description="Trials: an event camera's stream by its name; samples: any other one (force).",
     )
     store: Path | None = Field(
         default=None, description="Model: store of the test windows; default: the model's own."
@@ -62,12 +63,13 @@ def export(
         str | None,
         typer.Option(
             "--as",
-            help="Form. Of PART: aedat4, dsec or labels (.csv, .parquet, .json). Of a store: "
-            "croissant, mcap or lerobot. Of a model: onnx or card. Plug-ins add further ones.",
+            help="Form. Of PART: aedat4, dsec, or labels or samples (.csv, .parquet, .json). Of a "
+            "store: croissant, mcap or lerobot. Of a model: onnx or card. Plug-ins add others.",
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to write, or file for labels.")
+        Path,
+        typer.Option("--output", "-o", help="Folder to write, or file for labels and samples."),
     ] = ...,  # type: ignore[assignment]  # typer's word for: must be given
     options: ExportOptions = ExportOptions(),
     old_form: Annotated[str | None, typer.Option("--format", hidden=True)] = None,

@@ -205,9 +205,9 @@ def report(
     """Write report/index.html and report/summary.json, and compare with another report."""
     folder = located(store)
     if against is not None:
-        from sliplab.analysis.report.against import load_other
+        from sliplab.analysis.report.against import load_report
 
-        load_other(against)  # wrong input fails before anything is made
+        load_report(against)  # wrong input fails before anything is made
     done: dict[str, object] = {**run_step(folder, campaign, "report")}
     if against is not None:
         from sliplab.analysis.report.against import short_table

@@ -117,13 +117,15 @@ class Trial:
         return self.recording.simulated
 
     def streams(self) -> dict[str, str]:
-        """Kinds of the trial's streams by name: ``events``, ``frames``, ``scalar``, ``wrench``.
+        """Kinds of the trial's streams by name: ``events``, ``frames``, ``scalar``, ``wrench``, ...
 
         Those of the first cameras are named ``events`` and ``frames``, further ones as in the rig
         file.
         """
-        kinds = ("events", "frames", "scalar", "wrench")
-        return {name: kind for kind in kinds for name in self.recording.streams(kind)}
+        about = self.recording.record.streams
+        return {
+            name: about[name].kind if name in about else name for name in self.recording.streams()
+        }
 
     def events(
         self, start_ns: int | None = None, end_ns: int | None = None, stream: str = "events"

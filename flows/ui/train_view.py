@@ -16,11 +16,9 @@ from sliplab.storage.files import write_text
 
 
 @contextmanager
-def training_progress(
-    model: ModelOnDisk, epochs: int, simulated: bool
-) -> Iterator[TrainingProgress]:
+def training_progress(model: ModelOnDisk, simulated: bool) -> Iterator[TrainingProgress]:
     """Show the training of a model while the block runs."""
-    with console.bar(f"train {model.title} (epochs)", epochs) as bar:
+    with console.bar(f"train {model.title} (epochs)", model.settings.training.epochs) as bar:
         yield TrainingProgress(model, bar, simulated)
 
 

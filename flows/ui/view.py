@@ -319,6 +319,13 @@ def _further(to: _Columns, recording: Recording) -> None:
             time_ns = np.asarray(recording.clock(name).to_reference(found.t_ns))
             to.once(path, to.rr.SeriesLines(names=f"{name} ({found.unit})"))
             to.scalars(path, time_ns, found.value, count)
+        elif about.kind != WRENCH.name:
+            samples = recording.samples(name)
+            time_ns = samples.pop("t")
+            to.sent[count] = len(time_ns)
+            for part, values in samples.items():
+                for index, component in enumerate(values.reshape(len(time_ns), -1).T):
+                    to.scalars(f"{path}/{part}/{index}", time_ns, component)
 
 
 def _pictures(to: _Columns, recording: Recording, stream: str, path: str, count: str = "") -> None:
@@ -498,7 +505,8 @@ def blueprint(
     """
     views = library.blueprint
     force = [("force", "force on the plate (N)")] if forces else []
-    curves_of = _named(further, SCALAR.name, WRENCH.name)
+    cameras = _named(further, FRAMES_KIND, EVENTS_KIND)
+    curves_of = [name for name in sorted(further or {}) if name not in cameras]
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)
         for path, name in (
@@ -515,10 +523,7 @@ def blueprint(
         views.Spatial2DView(origin="/camera", name="outside camera, markers"),
         views.Spatial2DView(origin="/events", name="events"),
         views.Spatial3DView(origin="/arm", name="arm (mm)"),
-        *(
-            views.Spatial2DView(origin=f"/streams/{name}", name=name)
-            for name in _named(further, FRAMES_KIND, EVENTS_KIND)
-        ),
+        *(views.Spatial2DView(origin=f"/streams/{name}", name=name) for name in cameras),
     ]
     words = views.Horizontal(
         views.TextDocumentView(origin="/trial"), views.TextLogView(origin="/onset_log")

@@ -163,7 +163,7 @@ def simulated(drawn: SceneDraw) -> Scene:
 
     slip = Slip(*(since(truth[key]) for key in ("first_slip_ns", "incipient_ns", "gross_ns")))
     end_us = min(end_us, slip.gross_us + AFTER_GROSS_US)
-    events = EventChunk.concatenate(sink.events)
+    events = sink.taken("events", EventChunk)
     t_us = events.t_us - begin_ns // 1000
     inside = slice(*np.searchsorted(t_us, (0, end_us)))
     # copies: views would keep what follows in memory

@@ -16,6 +16,7 @@ from sliplab.plugins.driver_kit.rule import NotTried, Rules, RuleViolation
 from sliplab.plugins.driver_kit.sensor_benches import LOAD, ArmForceBench, ForceBench
 from sliplab.plugins.driver_kit.stream_bench import StreamBench
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.storage.streams import EVENTS, FRAMES, PULSES, WRENCH
 
 RULES = Rules[StreamBench]()
 """Rules of every kind of stream."""
@@ -38,19 +39,14 @@ WRAP_S = 0.015
 HOST_WAIT_S, HOST_LATE_S = 0.3, 0.2
 """Time from data to their read, and longest time to their reception, s."""
 COLUMNS: dict[str, tuple[str, int]] = {
-    "x": ("uint16", 1),
-    "y": ("uint16", 1),
-    "p": ("uint8", 1),
-    "t_us": ("int64", 1),
-    "t_ns": ("int64", 1),
-    "host_ns": ("int64", 1),
-    "number": ("int64", 1),
-    "sync": ("uint8", 1),
+    **{
+        column.field: (column.dtype, 1 + len(column.shape))
+        for kind in (EVENTS, FRAMES, PULSES, WRENCH)
+        for column in kind.columns.values()
+    },
     "images": ("uint8", 3),
     "markers_px": ("float32", 3),
     "plate_px": ("float32", 2),
-    "force_n": ("float64", 2),
-    "torque_nm": ("float64", 2),
 }
 """Type and number of axes of the arrays of a chunk, as `storage.streams` documents them."""
 

@@ -46,6 +46,7 @@ from sliplab.storage.formats.foreign import (
     FormatError,
     Triggers,
     as_damage,
+    empty_events,
     read_head,
 )
 from sliplab.storage.formats.format import Format
@@ -331,7 +332,7 @@ def _decoded(
     item = np.dtype(header.encoding.dtype).itemsize
     state = new_state(header.t0_us, *header.bits) if state is None else state
     edges = np.empty((_EDGES, 3), np.int64)
-    chunk, filled = _empty(), 0
+    chunk, filled = empty_events(_CHUNK), 0
     most_faults = (header.end - header.begin) // item // _WORDS_A_FAULT
     faults: list[DamagedWord] = []
     for place, words in _blocks(path, header):
@@ -352,8 +353,8 @@ def _decoded(
             )
             fault = int(state[FAULT])
             if fault or filled > _CHUNK - ROOM or state[EDGES] == _EDGES:
-                yield _part(chunk, filled), edges[: state[EDGES]].copy()
-                chunk, filled, state[EDGES] = _empty(), 0, 0
+                yield chunk[:filled], edges[: state[EDGES]].copy()
+                chunk, filled, state[EDGES] = empty_events(_CHUNK), 0, 0
             if fault:
                 where = f"{width} x {height} pixels {'in its header' if header.size else 'of all'}"
                 faults.append(DamagedWord(place + at * item, _reason(state, where)))
@@ -364,7 +365,7 @@ def _decoded(
                 if events_out:
                     out = {EVENTS_OUTSIDE: events_out}
                     yield _left_out(out), edges[:0].copy()
-    yield _part(chunk, filled), edges[: state[EDGES]].copy()
+    yield chunk[:filled], edges[: state[EDGES]].copy()
 
 
 def _reason(state: I64, where: str) -> str:
@@ -394,22 +395,9 @@ def _blocks(path: Path, header: Header) -> Iterator[tuple[int, npt.NDArray[Any]]
             at += count
 
 
-def _empty() -> EventChunk:
-    return EventChunk(
-        np.empty(_CHUNK, np.uint16),
-        np.empty(_CHUNK, np.uint16),
-        np.empty(_CHUNK, np.uint8),
-        np.empty(_CHUNK, np.int64),
-    )
-
-
 def _left_out(events: dict[str, int]) -> ForeignChunk:
-    none = _part(_empty(), 0)
+    none = empty_events(0)
     return ForeignChunk(none.x, none.y, none.p, none.t_us, events)
-
-
-def _part(chunk: EventChunk, count: int) -> EventChunk:
-    return chunk[:count]
 
 
 RAW = Format(

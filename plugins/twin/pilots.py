@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,11 +24,10 @@ from sliplab.plugins.twin.pilot import (
 from sliplab.plugins.twin.statistics import SlideStatistics, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.rig import FORCE
 from sliplab.rigs.mock.levels import choose_level
 from sliplab.rigs.rig_file import RigFile, load_rig_file
-from sliplab.storage.streams import (
-    EventChunk,
-)
+from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, WrenchChunk
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -214,27 +213,18 @@ def simulate_pilot(
             done = built.run_trial(program, sink, chance, size, rate_hz, with_events)
             steps = {step.phase: step for step, _ in done.steps}
             start_ns = steps["slide"].start_ns
-            frame_s = seconds_after(start_ns, np.concatenate([c.t_ns for c in sink.frames]))
-            xy_px = np.concatenate([c.markers_px for c in sink.frames if c.markers_px is not None])
+            frames, poses = sink.taken("frames", FrameChunk), sink.taken("arm", PoseChunk)
+            assert frames.markers_px is not None  # the camera returns tracks
+            frame_s = seconds_after(start_ns, frames.t_ns)
             middle = (np.array(size) - 1) / 2
-            pose_s = seconds_after(start_ns, np.concatenate([c.t_ns for c in sink.poses]))
-            xyz, turn = (
-                np.concatenate([getattr(c, name) for c in sink.poses])
-                for name in ("xyz_mm", "rotvec_deg")
-            )
+            pose_s = seconds_after(start_ns, poses.t_ns)
             camera = forces = None
-            if with_events and sink.events:
-                events = EventChunk.concatenate(sink.events)
-                t_us = events.t_us - start_ns // 1000
-                camera = SlideEvents(
-                    EventChunk(events.x, events.y, events.p, t_us),
-                    (built.events.width, built.events.height),
-                )
-            if sink.forces:
-                t_ns = np.concatenate([c.t_ns for c in sink.forces])
-                forces = Forces(
-                    seconds_after(start_ns, t_ns), np.concatenate([c.force_n for c in sink.forces])
-                )
+            if with_events and built.event_camera is not None:
+                events = sink.taken("events", EventChunk)
+                events = replace(events, t_us=events.t_us - start_ns // 1000)
+                camera = SlideEvents(events, (built.events.width, built.events.height))
+            if len(loads := sink.taken(FORCE, WrenchChunk)):
+                forces = Forces(seconds_after(start_ns, loads.t_ns), loads.force_n)
             found.append(
                 PilotTrial(
                     trial.id,
@@ -242,8 +232,8 @@ def simulate_pilot(
                     (steps["hold"].start_ns - start_ns) * 1e-9,
                     (steps["slide"].end_ns - start_ns) * 1e-9,
                     frame_s,
-                    (xy_px - middle) * [1.0, -1.0] / scale,
-                    base_at(pose_s, xyz, turn, frame_s),
+                    (frames.markers_px - middle) * [1.0, -1.0] / scale,
+                    base_at(pose_s, poses.xyz_mm, poses.rotvec_deg, frame_s),
                     camera,
                     forces,
                 )

@@ -17,12 +17,12 @@ from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Code, ForceGrade
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.storage.streams import (
+    Chunk,
     ClockReads,
     EventChunk,
     FrameChunk,
     PoseChunk,
     PulseChunk,
-    ScalarChunk,
     Sink,
     WrenchChunk,
 )
@@ -307,11 +307,8 @@ class ForceSensor(Protocol):
 
 
 @runtime_checkable
-class ScalarSensor(Protocol):
-    """A sensor of one quantity, such as a temperature, which the host times by arrival."""
-
-    unit: str
-    """Unit of its readings."""
+class Sensor(Protocol):
+    """A sensor with a stream, which the host times by arrival."""
 
     def connect(self) -> None:
         """Open the connection; bounded. Raises RigError."""
@@ -319,8 +316,8 @@ class ScalarSensor(Protocol):
     def start(self) -> None:
         """Start streaming; earlier readings are discarded."""
 
-    def read(self) -> ScalarChunk:
-        """Readings since the last call, `t_ns` the host's clock at reception.
+    def read(self) -> Chunk:
+        """Readings since the last call, their times the host's clock at reception.
 
         Raises:
             RigError: it fell silent.
@@ -331,6 +328,14 @@ class ScalarSensor(Protocol):
 
     def close(self) -> None:
         """Close the connection."""
+
+
+@runtime_checkable
+class ScalarSensor(Sensor, Protocol):
+    """A sensor of one quantity, such as a temperature; it returns `ScalarChunk`."""
+
+    unit: str
+    """Unit of its readings."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         ForceSensor,
         FrameCamera,
         Gripper,
-        ScalarSensor,
+        Sensor,
         SyncBox,
     )
     from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sliplab.rigs.core.finger_motion import FingerMotion
     from sliplab.rigs.core.gripper_range import GripperRange
     from sliplab.rigs.core.rig import Rig
-    from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, WrenchChunk
+    from sliplab.storage.streams import EventChunk, FrameChunk, PulseChunk, StreamKind, WrenchChunk
 
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
 ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)
@@ -329,9 +329,20 @@ class GripperDriver(Driver[GripperSettingsT]):
 
 
 @dataclass(frozen=True)
-class ScalarSensorDriver(Driver[SettingsT]):
-    """A kind of sensor of one quantity."""
+class SensorDriver(Driver[SettingsT]):
+    """A kind of sensor of one quantity, or of another kind of stream."""
 
     kind = "scalar sensor"
-    build: Callable[[SettingsT], ScalarSensor] = field(kw_only=True)
-    """Make the device, not connected yet."""
+    build: Callable[[SettingsT], Sensor] = field(kw_only=True)
+    """Make the device, not connected yet; a `ScalarSensor` where `stream` is not set."""
+    stream: StreamKind | None = None
+    """The kind of its stream; None for readings of one quantity."""
+
+    @property
+    def sends(self) -> str:
+        """The kind's name, which a rig file writes as `kind`."""
+        return "scalar" if self.stream is None else self.stream.name
+
+
+ScalarSensorDriver = SensorDriver
+"""The former name, which packages use."""

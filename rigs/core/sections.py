@@ -26,11 +26,6 @@ class RigSection(StrictModel):
     def gripper_range(self) -> GripperRange | None:
         """Values that the gripper's commands may have; None without a gripper."""
 
-    @property
-    @abstractmethod
-    def grip_opening_mm(self) -> float | None:
-        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-
     def plan_faults(self, plan: Plan, file: str) -> Iterator[InputError]:
         """Return what these devices cannot do of a plan."""
         yield from ()
@@ -43,11 +38,6 @@ class SimulatedRig(RigSection):
     @abstractmethod
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
-
-    @property
-    @abstractmethod
-    def block_ms(self) -> int:
-        """Duration of the blocks that the event camera sends."""
 
     @abstractmethod
     def rig_faults(self, rig: Any) -> Iterator[KeyedError]:

@@ -18,6 +18,9 @@ from sliplab.rigs.stream_settings import keyed_drivers
 if TYPE_CHECKING:
     from sliplab.rigs.rig_file import RigFile
 
+STREAMS = "streams."
+"""Before the name of a further camera's stream, among the names of fakes."""
+
 
 def _faults(rig: RigFile) -> Iterator[KeyedError]:
     """Check that the fakes simulate what the rig file says of the real devices."""
@@ -40,10 +43,10 @@ def _faults(rig: RigFile) -> Iterator[KeyedError]:
     if devices.has_force and not mock.has_force:
         text = "is needed: it is what the fake of devices.force_sensor shows"
         yield KeyedError("mock.force", None, text)
-    opening_mm = devices.grip_opening_mm
-    if opening_mm is not None and mock.grip_opening_mm != opening_mm:
+    opening_mm, simulated = rig.grip_opening_mm, mock.gripper and mock.gripper.opening_mm
+    if opening_mm is not None and simulated != opening_mm:
         text = f"must be {opening_mm:g}: the fake of devices.gripper moves these fingers"
-        yield KeyedError("mock.gripper.opening_mm", mock.grip_opening_mm, text)
+        yield KeyedError("mock.gripper.opening_mm", simulated, text)
     for key, driver, _ in keyed_drivers(devices, rig.streams):
         fake: Any = None
         if isinstance(driver, EventCameraDriver):

@@ -24,6 +24,7 @@ from sliplab.rigs.core.capabilities import PlateCourse, RigError, Truth
 from sliplab.rigs.core.driver import EventCameraDriver
 from sliplab.rigs.core.library_process import PipeCalls
 from sliplab.rigs.device_section import DeviceSettings
+from sliplab.rigs.loopback import STREAMS
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import RigFile
@@ -41,10 +42,6 @@ TURN_S = 0.004
 END_S = 5.0
 
 
-Addresses = tuple[Any, Any, Any, Any, Mapping[str, Any]]
-"""Of sync box, event camera, force sensor, gripper and further cameras."""
-
-
 class Loopback:
     """The fakes of a loopback rig, running until `close`.
 
@@ -54,11 +51,8 @@ class Loopback:
         on_frames: called in a thread with the frames of the outside camera.
 
     Attributes:
-        sync_address: address of the sync box.
-        event_address: where the event camera's driver finds its fake.
-        stream_addresses: the same of further event cameras, by the names of their streams.
-        force_address, gripper_address: where those of the force sensor and the gripper do; None
-            without one.
+        addresses: where the driver of each device finds its fake: by `event_camera`, `sync_box`,
+            `force_sensor`, `gripper`, or `STREAMS` and the name of a further event camera's stream.
 
     Raises:
         RigError: they do not start.
@@ -91,7 +85,7 @@ class Loopback:
         their_frames.close()
         self._calls = PipeCalls(ours, self._process.kill, pending=1)
         try:
-            self._take(self._result(lambda: self._calls.answer(READY_S)))
+            self.addresses: Mapping[str, Any] = self._result(lambda: self._calls.answer(READY_S))
         except BaseException:
             self.close()
             raise
@@ -111,28 +105,19 @@ class Loopback:
         """Return a rig file whose drivers reach these fakes."""
         devices = file.devices
         assert devices is not None
-        reached = {
-            name: driver.reach(getattr(devices, name), address)
-            for name, driver, address in (
-                ("event_camera", devices.event_camera_driver, self.event_address),
-                ("sync_box", devices.sync_box_driver, self.sync_address),
-                ("force_sensor", devices.force_sensor_driver, self.force_address),
-                ("gripper", devices.gripper_driver, self.gripper_address),
-            )
-            if driver is not None and driver.reach is not None
-        }
+        reached = {}
+        for name in ("event_camera", "sync_box", "force_sensor", "gripper"):
+            driver = getattr(devices, f"{name}_driver")
+            if driver is not None and driver.reach is not None:
+                reached[name] = driver.reach(getattr(devices, name), self.addresses[name])
         streams: dict[str, Stream] = {}
         for name, stream in file.streams.items():
             assert isinstance(stream.driver, EventCameraDriver)  # the file was held against it
             assert stream.driver.reach is not None
-            device = stream.driver.reach(stream.device, self.stream_addresses[name])
+            device = stream.driver.reach(stream.device, self.addresses[STREAMS + name])
             streams[name] = stream.model_copy(update={"device": device})
         changes = {"devices": devices.model_copy(update=reached), "streams": streams}
         return file.model_copy(update=changes)
-
-    def _take(self, addresses: Addresses) -> None:
-        self.sync_address, self.event_address, self.force_address = addresses[:3]
-        self.gripper_address, self.stream_addresses = addresses[3:]
 
     # -- Simulation ------------------------------------------------------------------------
 
@@ -192,7 +177,7 @@ class Loopback:
 
     def restore(self, device: str) -> None:
         """Clear a device's faults; see `SimulationServer.restore`. Drivers must be rebuilt."""
-        self._take(self._ask("restore", device))
+        self.addresses = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
         """Return the true position of the sensor: right and up on the plate, and depth, mm."""

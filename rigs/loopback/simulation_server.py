@@ -25,9 +25,7 @@ from sliplab.rigs.core.capabilities import ArmState, PlateCourse, Pose, RigError
 from sliplab.rigs.core.driver import (
     ArmScene,
     EventCameraDriver,
-    FakeEventCamera,
     FakeForceSensor,
-    FakeGripper,
     GripperScene,
     PulseTrain,
 )
@@ -36,6 +34,7 @@ from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.device_section import DeviceSettings
+from sliplab.rigs.loopback import STREAMS
 from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.loopback.tool_load import ToolLoad
 from sliplab.rigs.mock.clocks import trial_clocks
@@ -54,6 +53,15 @@ from sliplab.rigs.mock.world import SimulatedWorld, start_pose
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
 
+CAMERA = "event_camera"
+FAULTS = {
+    "sync_box": ("reset", "silence"),
+    CAMERA: ("stall",),
+    "force_sensor": ("silence", "overload"),
+    "gripper": ("silence", "fail"),
+}
+"""Faults of each fake but the arm's, by the names of its methods; further cameras have the first
+one's."""
 REACH_MM = 2_000.0
 """Reach of the fake arm; the driver enforces the rig file's limits."""
 I64 = npt.NDArray[np.int64]
@@ -110,19 +118,17 @@ class SimulationServer:
         self._level = SyncLevel(self._box_clock)
         self._sent: Counter[str] = Counter()
         self._stamps_us: list[I64] = []
-        self._size = settings.event_camera.width, settings.event_camera.height
         fake_box = devices.sync_box_driver.fake
         assert fake_box is not None  # the rig file was held against it
-        self._make_box = partial(fake_box, self._box_now_ns, self._on_train)
-        self.sync_box = self._make_box()
+        self._make: dict[str, Callable[[], Any]] = {
+            "sync_box": partial(fake_box, self._box_now_ns, self._on_train)
+        }
         fake_arm, fake_camera = devices.arm_driver.fake, devices.event_camera_driver.fake
         assert fake_arm is not None  # the rig file was held against it
         assert fake_camera is not None
-        self._make_camera = partial(fake_camera, self._size)
-        self.camera = self._make_camera()
+        size = settings.event_camera.width, settings.event_camera.height
+        self._make[CAMERA] = partial(fake_camera, size)
         self._force: MockForceSensor | None = None
-        self._make_force = None
-        self.force: FakeForceSensor | None = None
         self._tool_load: ToolLoad | None = None
         if (driver := devices.force_sensor_driver) is not None:
             assert settings.force is not None  # the rig file was held against it
@@ -138,16 +144,13 @@ class SimulationServer:
             else:
                 assert driver.fake is not None
                 self._force = MockForceSensor(self.world, alone)
-                self._make_force = partial(driver.fake, devices.force_sensor)
-                self.force = self._make_force()
+                self._make["force_sensor"] = partial(driver.fake, devices.force_sensor)
             self._force.start()
-        self.gripper: FakeGripper | None = None
         if (gripper := devices.gripper_driver) is not None:
             assert self.world.fingers is not None  # the rig file was held against it
             assert gripper.fake is not None
             fingers = GripperScene(self.world.fingers, self._trial_now_ns)
-            self._make_gripper = partial(gripper.fake, devices.gripper, fingers)
-            self.gripper = self._make_gripper()
+            self._make["gripper"] = partial(gripper.fake, devices.gripper, fingers)
         scene = ArmScene(
             self._path.motion,
             ControllerClock(self._arm_now_s),
@@ -156,32 +159,26 @@ class SimulationServer:
             None if self._tool_load is None else self._tool_load.at,
         )
         self.arm = fake_arm(devices.arm, scene)
-        self._further: dict[str, MockEventCamera] = {}
-        self._make_further: dict[str, Callable[[], FakeEventCamera]] = {}
+        self._cameras = {CAMERA: self._events}
         for name, (kind, made) in (further or {}).items():
             own = Identity[MockEventCameraSettings](name, made, made.clock_ppm, made.seed)
-            self._further[name] = MockEventCamera(self.world, self._box, own)
+            self._cameras[STREAMS + name] = MockEventCamera(self.world, self._box, own)
             fake = find_driver(kind, EventCameraDriver).fake
             assert fake is not None  # the rig file was checked against it
-            self._make_further[name] = partial(fake, (made.width, made.height))
-        self.further = {name: make() for name, make in self._make_further.items()}
+            self._make[STREAMS + name] = partial(fake, (made.width, made.height))
+        self._fakes = {name: make() for name, make in self._make.items()}
         self.arm.start()
         self._start_events()
 
     @property
-    def addresses(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """The addresses of sync box, event camera, force sensor, gripper and further cameras."""
-        further = {name: camera.address for name, camera in self.further.items()}
-        force = self.force and self.force.address
-        gripper = self.gripper and self.gripper.address
-        return self.sync_box.address, self.camera.address, force, gripper, further
+    def addresses(self) -> dict[str, Any]:
+        """The address of each fake but the arm's; see `Loopback`."""
+        return {name: fake.address for name, fake in self._fakes.items()}
 
     def close(self) -> None:
         """Close every fake."""
-        parts = self.arm, self.camera, self.sync_box, self.force, self.gripper
-        for part in (*parts, *self.further.values()):
-            if part is not None:
-                part.close()
+        for fake in (self.arm, *self._fakes.values()):
+            fake.close()
 
     # -- time ------------------------------------------------------------------------------
 
@@ -214,26 +211,25 @@ class SimulationServer:
             self._path.cut_ns = None
             protective = world.arm_state is ArmState.PROTECTIVE_STOP
             self.arm.inject(Kind.PROTECTIVE_STOP if protective else Kind.PROGRAM_END)
-        chunk, pulses = self._events.read(), self._events.read_pulses()
-        if len(chunk) or len(pulses.t_ns):
-            self.camera.send(chunk, pulses)
-            self._sent["events"] += len(chunk)
-            self._sent["event_pulses"] += len(pulses.t_ns)
-            self._stamps_us.append(chunk.t_us)
-        for name, seen in self._further.items():
-            found, edges = seen.read(), seen.read_pulses()
-            if len(found) or len(edges):
-                self.further[name].send(found, edges)
-                self._sent[name] += len(found)
-        if self._force is not None and self.force is not None:
-            self._send_forces(self._force, self.force)
+        for name, seen in self._cameras.items():
+            chunk, pulses = seen.read(), seen.read_pulses()
+            if not len(chunk) and not len(pulses):
+                continue
+            self._fakes[name].send(chunk, pulses)
+            if seen is self._events:
+                self._sent.update({"events": len(chunk), "event_pulses": len(pulses)})
+                self._stamps_us.append(chunk.t_us)
+            else:
+                self._sent[name.removeprefix(STREAMS)] += len(chunk)
+        if self._force is not None and "force_sensor" in self._fakes:
+            self._send_forces(self._force, self._fakes["force_sensor"])
         if self._tool_load is not None and self._tool_load.follow():
             self.arm.inject(Kind.PROTECTIVE_STOP)
         if self._grabbing:
             self._send_frames()
 
     def _start_events(self) -> None:
-        for camera in (self._events, *self._further.values()):
+        for camera in self._cameras.values():
             camera.start()
 
     def _send_forces(self, seen: MockForceSensor, wire: FakeForceSensor) -> None:
@@ -316,7 +312,7 @@ class SimulationServer:
 
     def sent(self) -> Counter[str]:
         """Return the counts of data sent since the trial began; pulses since the last ARM."""
-        return self._sent + Counter({"box_pulses": self.sync_box.pulses})
+        return self._sent + Counter({"box_pulses": self._fakes["sync_box"].pulses})
 
     def events_between(self, first_us: int, last_us: int) -> int:
         """Return the number of sent events with time stamps from first to last, us, inclusive."""
@@ -373,44 +369,26 @@ class SimulationServer:
         Args:
             device: ``arm``, ``sync_box``, ``event_camera``, ``force_sensor``, ``gripper``, or the
                 name of a further event camera's stream.
-            kind: for the arm a value of `rigs.core.fakes.Kind`; for the sync box ``reset``,
-                ``silence`` or ``unplug``; for the event camera ``stall`` or ``unplug``; for the
-                force sensor ``silence``, ``overload`` or ``unplug``; for the gripper ``silence``,
-                ``fail`` or ``unplug``.
+            kind: for the arm a value of `rigs.core.fakes.Kind`; for another ``unplug``, or one of
+                its `FAULTS`.
 
         Raises:
             RigError: no such fault.
         """
-        known: dict[str, dict[str, Callable[[], None]]] = {
-            "arm": {found.value: partial(self.arm.inject, found) for found in Kind},
-            "sync_box": {
-                "reset": self.sync_box.reset,
-                "silence": self.sync_box.silence,
-                "unplug": self.sync_box.close,
-            },
-            "event_camera": {"stall": self.camera.stall, "unplug": self.camera.close},
-        }
-        for name, camera in self.further.items():
-            known[name] = {"stall": camera.stall, "unplug": camera.close}
-        if self.force is not None:
-            known["force_sensor"] = {
-                "silence": self.force.silence,
-                "overload": self.force.overload,
-                "unplug": self.force.close,
-            }
-        if self.gripper is not None:
-            known["gripper"] = {
-                "silence": self.gripper.silence,
-                "fail": self.gripper.fail,
-                "unplug": self.gripper.close,
-            }
-        try:
-            what = known[device][kind]
-        except KeyError:
-            raise RigError(device, f"its fake cannot simulate '{kind}'") from None
-        what()
+        known: dict[str, Callable[[], None]] = {}
+        if device == "arm":
+            known = {found.value: partial(self.arm.inject, found) for found in Kind}
+        elif (fake := self._fakes.get(name := self._name(device))) is not None:
+            known = {fault: getattr(fake, fault) for fault in FAULTS.get(name, FAULTS[CAMERA])}
+            known["unplug"] = fake.close
+        if kind not in known:
+            raise RigError(device, f"its fake cannot simulate '{kind}'")
+        known[kind]()
 
-    def restore(self, device: str) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def _name(self, device: str) -> str:
+        return device if device in self._fakes else STREAMS + device
+
+    def restore(self, device: str) -> dict[str, Any]:
         """Recover a device from any fault, as an operator would.
 
         A stopped arm is unlocked and moved clear of the plate; other devices are reconnected.
@@ -428,21 +406,9 @@ class SimulationServer:
                 clear = self.world.plane.pose(x, y, -CLEAR_MM)
                 now_s = self._arm_now_s()
                 self._path.motion.move(clear, PENDANT_MM_S, PENDANT_MM_S2, now_s)
-        elif device == "sync_box":
-            self.sync_box.close()
-            self.sync_box = self._make_box()
-        elif device == "event_camera":
-            self.camera.close()
-            self.camera = self._make_camera()
-        elif device == "force_sensor" and self.force is not None and self._make_force is not None:
-            self.force.close()
-            self.force = self._make_force()
-        elif device == "gripper" and self.gripper is not None:
-            self.gripper.close()
-            self.gripper = self._make_gripper()
-        elif device in self.further:
-            self.further[device].close()
-            self.further[device] = self._make_further[device]()
+        elif (name := self._name(device)) in self._fakes:
+            self._fakes[name].close()
+            self._fakes[name] = self._make[name]()
         else:
             raise RigError(device, "has no fake")
         return self.addresses

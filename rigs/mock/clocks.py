@@ -157,22 +157,15 @@ class FaultyClock(ClockMap):
         return result
 
     def _drifts(self) -> list[tuple[ClockDrift, int]]:
-        return [
-            (fault, due)
-            for fault, due, _ in self.faults.spans(ClockDrift)
-            if fault.device == self.device
-        ]
+        spans = self.faults.spans(ClockDrift, target=self.device)
+        return [(fault, due) for fault, due, _ in spans]
 
     def _jumps(self) -> list[tuple[int, int]]:
         """Return the true times of the jumps, increasing, and their sizes, ns."""
-        mine: list[tuple[int, ClockJump | ClockRestart]] = []
-        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockJump)]
-        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockRestart)]
+        mine = self.faults.spans(ClockJump, ClockRestart, target=self.device)
         jumps: list[tuple[int, int]] = []
         total = 0
-        for due, fault in sorted(mine, key=lambda item: item[0]):
-            if fault.device != self.device:
-                continue
+        for fault, due, _ in sorted(mine, key=lambda item: item[1]):
             if isinstance(fault, ClockJump):
                 jump_ns = round(fault.seconds * 1e9)
             else:
@@ -211,7 +204,7 @@ class FaultyClock(ClockMap):
 
 def with_faults(clocks: ClockMaps, faults: FaultBook) -> ClockMaps:
     """Return the clocks with the trial's clock faults applied."""
-    if not any(faults.of(kind) for kind in _CLOCK_FAULTS):
+    if not faults.of(*_CLOCK_FAULTS):
         return clocks
     return replace(
         clocks,
@@ -223,8 +216,7 @@ def with_faults(clocks: ClockMaps, faults: FaultBook) -> ClockMaps:
 
 def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
     """Return `clock` with the trial's faults applied."""
-    hit = [fault.device for kind in _CLOCK_FAULTS for fault in faults.of(kind)]
-    if device not in hit:
+    if not faults.of(*_CLOCK_FAULTS, target=device):
         return clock
     return FaultyClock(clock.device_ns, clock.reference_ns, clock.drift, device, faults)
 

@@ -13,7 +13,7 @@ from sliplab.protocols.timing import FrameGrade, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.fault_kinds import CabledDevice, DeviceGone, DiskFull, StreamGone
+from sliplab.rigs.mock.fault_kinds import DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import FurtherEventCamera, FurtherFrameCamera, Thermometer
@@ -60,42 +60,34 @@ class Guarded:
         return call
 
 
-def on_cable(device: T, name: CabledDevice, world: SimulatedWorld) -> T:
-    """Wrap `device` so that calls fail while a fault disconnects it; unchanged without faults."""
-    if not any(isinstance(f, DeviceGone) and f.device == name for f in world.settings.faults):
+Cut = type[DeviceGone] | type[StreamGone]
+
+
+def on_cable(device: T, name: str, world: SimulatedWorld, kind: Cut = DeviceGone) -> T:
+    """Wrap `device` so that calls fail while a fault disconnects it; unchanged without faults.
+
+    Args:
+        name: of the device; for `StreamGone` of a further device's stream.
+    """
+    if not any(isinstance(f, kind) and f.target == name for f in world.settings.faults):
         return device
+    words = "further device" if kind is StreamGone else name.replace("_", " ")
+    error = ArmFault if words == "arm" else RigError
 
     def check() -> None:
-        if world.faults.gone(name, world.now_ns):
-            words = name.replace("_", " ")
-            raise ArmFault(words, GONE) if name == "arm" else RigError(words, GONE)
-
-    return cast(T, Guarded(device, check))
-
-
-def on_stream_cable(device: T, name: str, world: SimulatedWorld) -> T:
-    """Wrap a further device as `on_cable` does, by the name of its stream."""
-    if not any(isinstance(f, StreamGone) and f.stream == name for f in world.settings.faults):
-        return device
-
-    def check() -> None:
-        if any(
-            gone.stream == name and begin <= world.now_ns < end
-            for gone, begin, end in world.faults.spans(StreamGone)
-        ):
-            raise RigError("further device", GONE)
+        if world.faults.active(kind, world.now_ns, name):
+            raise error(words, GONE)
 
     return cast(T, Guarded(device, check))
 
 
 def on_disk(sink: Sink, world: SimulatedWorld) -> Sink:
     """Wrap `sink` so that writes fail once a fault fills the disk; unchanged without faults."""
-    full = world.faults.of(DiskFull)
-    if not full:
+    if not world.faults.of(DiskFull):
         return sink
 
     def check() -> None:
-        if any(begin <= world.now_ns for _, begin, _ in world.faults.spans(DiskFull)):
+        if world.faults.active(DiskFull, world.now_ns):
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} (simulated fault)")
 
     return cast(Sink, Guarded(sink, check))
@@ -190,7 +182,7 @@ def build_mock(
         force=force,
         gripper=gripper,
         further={
-            name: on_stream_cable(_further(name, stream, world, sync), name, world)
+            name: on_cable(_further(name, stream, world, sync), name, world, StreamGone)
             for name, stream in (further or {}).items()
         },
     )

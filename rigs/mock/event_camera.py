@@ -17,7 +17,7 @@ from sliplab.rigs.mock.nuisances import brushing
 from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from sliplab.rigs.mock.world import SimulatedWorld
-from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.rigs.scene.events import MarkerSensor
 from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.readout import ScanTimes
 from sliplab.storage.streams import EventChunk, PulseChunk
@@ -139,11 +139,8 @@ class MockEventCamera:
         self._own = own or Identity("event_camera", world.settings.event_camera)
         settings = self._own.settings
         self.width, self.height = settings.width, settings.height
-        optics = EventOptics(
-            **settings.model_dump(include=set(MockEventCameraSettings.model_fields))
-        )
         seed = self._own.fabrication_seed(world)
-        self._sensor = MarkerSensor(optics, world.skin.layout_mm, seed)
+        self._sensor = MarkerSensor(settings, world.skin.layout_mm, seed)
         self._loads_of = "" if self._own.first else self._own.name
         self._bursts = Bursts(world, self.width, self.height) if self._own.first else None
         self._input = SyncInput(world, box, self._own.name)

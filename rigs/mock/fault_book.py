@@ -18,7 +18,7 @@ from sliplab.rigs.mock.fault_kinds import (
     AnyFault,
     ArmProtectiveStop,
     ArmRamp,
-    CabledDevice,
+    BaseFault,
     Device,
     DeviceGone,
     EventGap,
@@ -33,7 +33,7 @@ from sliplab.rigs.scene.skin import Skin
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-F = TypeVar("F", bound=AnyFault)
+F = TypeVar("F", bound=BaseFault)
 
 NEVER = 1 << 62
 """True time that no trial reaches, ns."""
@@ -57,11 +57,16 @@ class FaultBook:
         self._travels: dict[int, _Travel] = {}
         self.recording_ns: int | None = None
 
-    def of(self, kind: type[F]) -> list[F]:
-        """Return the trial's faults of one kind."""
-        return [fault for fault in self._faults if isinstance(fault, kind)]
+    def of(self, *kinds: type[F], target: str | None = None) -> list[F]:
+        """Return the trial's faults of some kinds, by kind; only those of `target` if given."""
+        return [
+            fault
+            for kind in kinds
+            for fault in self._faults
+            if isinstance(fault, kind) and target in {None, fault.target}
+        ]
 
-    def due_ns(self, fault: AnyFault) -> int | None:
+    def due_ns(self, fault: BaseFault) -> int | None:
         """Return the true time of `fault`; None while its recording has not begun.
 
         A fault without a time is active from the trial's start.
@@ -70,18 +75,22 @@ class FaultBook:
         origin = 0 if since == "trial" else self.recording_ns
         return None if origin is None else origin + round(at_s * 1e9)
 
-    def spans(self, kind: type[F]) -> list[tuple[F, int, int]]:
-        """Return the faults of one kind with a known time, with true begin and end, ns.
+    def spans(self, *kinds: type[F], target: str | None = None) -> list[tuple[F, int, int]]:
+        """Return the faults as `of` does that have a known time, with true begin and end, ns.
 
         The end is `NEVER` for a permanent fault.
         """
         found = []
-        for fault in self.of(kind):
+        for fault in self.of(*kinds, target=target):
             begin = self.due_ns(fault)
             if begin is not None:
                 seconds = getattr(fault, "seconds", None)
                 found.append((fault, begin, NEVER if seconds is None else begin + _ns(seconds)))
         return found
+
+    def active(self, kind: type[F], now_ns: int, target: str | None = None) -> bool:
+        """Return whether a fault of a kind lasts at a true time."""
+        return any(begin <= now_ns < end for _, begin, end in self.spans(kind, target=target))
 
     # -- the arm ---------------------------------------------------------------------------
 
@@ -139,9 +148,8 @@ class FaultBook:
 
     def gaps_ns(self) -> list[tuple[int, int]]:
         """Return the true intervals in which the event camera loses its data."""
-        gone = [span for span in self.spans(DeviceGone) if span[0].device == "event_camera"]
-        gaps = [(begin, end) for _, begin, end in self.spans(EventGap)]
-        return gaps + [(begin, end) for _, begin, end in gone]
+        gaps = self.spans(EventGap) + self.spans(DeviceGone, target="event_camera")
+        return [(begin, end) for _, begin, end in gaps]
 
     def sent_until_ns(self, now_ns: int) -> int:
         """Return the true time up to which the event camera has sent its data."""
@@ -183,16 +191,9 @@ class FaultBook:
 
     # -- any device ------------------------------------------------------------------------
 
-    def gone(self, device: CabledDevice, now_ns: int) -> bool:
-        """Return whether `device` has lost its power or its cable."""
-        return any(
-            fault.device == device and begin <= now_ns < end
-            for fault, begin, end in self.spans(DeviceGone)
-        )
-
     def lost_power_ns(self, device: Device, since_ns: int) -> int:
         """Return the first power loss of `device` from `since_ns` on; `NEVER` if there is none."""
-        times = [begin for fault, begin, _ in self.spans(DeviceGone) if fault.device == device]
+        times = [begin for _, begin, _ in self.spans(DeviceGone, target=device)]
         return min((begin for begin in times if begin >= since_ns), default=NEVER)
 
 

@@ -24,12 +24,20 @@ RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 
-class _Fault(StrictModel):
+class BaseFault(StrictModel):
+    """What every fault has."""
+
     trial: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Number of the trial on this rig, from 1; every trial if left out."""
 
+    @property
+    def target(self) -> str | None:
+        """The device that has it, or the stream of a further device; None if it names none."""
+        target: str | None = getattr(self, "device", getattr(self, "stream", None))
+        return target
 
-class _TimedFault(_Fault):
+
+class _TimedFault(BaseFault):
     at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.5
     """Time of the fault after the moment that `since` names."""
     since: Literal["trial", "recording"] = "recording"
@@ -178,13 +186,13 @@ class MarkerOccluded(_TimedFault):
         return self
 
 
-class PlateStuck(_Fault):
+class PlateStuck(BaseFault):
     """The slider jams: a released plate does not fall."""
 
     kind: Literal["plate_stuck"]
 
 
-class PapillaSticky(_Fault):
+class PapillaSticky(BaseFault):
     """One papilla grips more (or less) than the others of its layer."""
 
     kind: Literal["papilla_sticky"]
@@ -194,7 +202,7 @@ class PapillaSticky(_Fault):
     """Its friction over what it would be without the fault."""
 
 
-class SkinWear(_Fault):
+class SkinWear(BaseFault):
     """Tips wear: each grips more or less, the further it has slid on this rig.
 
     Friction is exp(per_m s) times that of a new tip. The path s is what the tip slid in earlier
@@ -206,7 +214,7 @@ class SkinWear(_Fault):
     """Relative change of friction per metre; negative: the tips become smoother."""
 
 
-class PlateSpot(_Fault):
+class PlateSpot(BaseFault):
     """A round spot on the plate, on which friction differs; factors of several multiply."""
 
     kind: Literal["plate_spot"]
@@ -297,7 +305,7 @@ class SkinBrushed(_TimedFault):
     """Of the way on the skin; if left out, it belongs to the trial."""
 
 
-class ArmRamp(_Fault):
+class ArmRamp(BaseFault):
     """The arm speeds up and brakes gently in every straight move that begins or ends in contact."""
 
     kind: Literal["arm_ramp"]

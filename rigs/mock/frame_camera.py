@@ -27,7 +27,6 @@ from sliplab.rigs.scene.frames import (
     Exposures,
     FrameOptics,
     PlateView,
-    Reflections,
     expose,
 )
 from sliplab.rigs.scene.lens import BoardCamera, BoardPlace, BoardPrint, draw_board
@@ -250,7 +249,7 @@ def _optics(settings: MockSettings, camera: MockFrameCameraSettings) -> FrameOpt
         tilt_deg=camera.tilt_deg,
         k1=camera.k1,
         distance_mm=camera.distance_mm,
-        reflections=Reflections(**camera.reflections.model_dump()),
+        reflections=camera.reflections,
     )
 
 
@@ -274,10 +273,9 @@ class FrameFaults:
         for fault, begin_ns, _ in self._world.faults.spans(FramesLost):
             first = self._trigger.tick_at(begin_ns)
             lost |= (ticks >= first) & (ticks < first + fault.count)
-        for gone, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
-            if gone.device == "frame_camera":
-                true_ns = self._trigger.true_ns(ticks)
-                lost |= (true_ns >= begin_ns) & (true_ns < end_ns)
+        for _, begin_ns, end_ns in self._world.faults.spans(DeviceGone, target="frame_camera"):
+            true_ns = self._trigger.true_ns(ticks)
+            lost |= (true_ns >= begin_ns) & (true_ns < end_ns)
         return lost
 
     def arrival_ns(self, ticks: I64, on_time_ns: I64) -> I64:

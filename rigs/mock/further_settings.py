@@ -9,14 +9,12 @@ from pydantic import Field
 
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.rigs.mock.settings import (
-    Finite,
     FurtherDevice,
     MockEventCameraSettings,
     MockFrameCameraSettings,
-    NonNegative,
-    Positive,
     Seed,
 )
+from sliplab.rigs.scene.optics import Finite, NonNegative, Positive
 
 if TYPE_CHECKING:
     from sliplab.rigs.stream_settings import FrameStream

@@ -22,6 +22,7 @@ from sliplab.protocols.yaml_file import StrictModel, rule
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.core.sections import SimulatedRig, SimulatedStream
 from sliplab.rigs.mock.fault_kinds import Fault, StreamGone, check_papillae, check_single
+from sliplab.rigs.scene.optics import EventOptics, Finite, NonNegative, Positive, Reflections
 
 if TYPE_CHECKING:
     from sliplab.rigs.rig_file import RigFile
@@ -29,10 +30,7 @@ if TYPE_CHECKING:
 
 SCALE_ERROR = 0.005
 """Largest relative error of a measured scale."""
-Positive = Annotated[float, Field(gt=0, le=1e9)]
-NonNegative = Annotated[float, Field(ge=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, lt=1)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
 Triple = tuple[Finite, Finite, Finite]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
@@ -175,80 +173,8 @@ class SceneSettings(StrictModel):
     contact: PlatePosition = PlatePosition()
 
 
-class MockEventCameraSettings(StrictModel):
+class MockEventCameraSettings(EventOptics):
     """The event camera inside the sensor and the markers that it sees."""
-
-    width: Annotated[int, Field(ge=64, le=4096)] = 640
-    height: Annotated[int, Field(ge=64, le=4096)] = 480
-    px_per_mm: Positive = 14.0
-    shift_mm_per_n: Finite = 4.5
-    """Motion of a marker in the image per tangential force, in mm of the skin."""
-    growth_mm_per_n: Finite = 0.4
-    """Growth of a marker's radius with normal force."""
-    radius_mm: Positive = 1.2
-    edge_px: Positive = 0.8
-    """Scale of the logistic edge; the profile is truncated at five scales."""
-    contrast: Positive = 2.08
-    """Log intensity of a marker relative to its surroundings."""
-    threshold: Positive = 0.2
-    threshold_sigma: NonNegative = 0.03
-    """Standard deviation between pixels, clipped at three sigma."""
-    threshold_off: Positive | None = None
-    """Mean threshold of negative events; null: as `threshold`. With this or the next setting,
-    negative thresholds are drawn independently; without, a pixel has one for both polarities."""
-    threshold_off_sigma: NonNegative | None = None
-    """Standard deviation of negative thresholds; null: as `threshold_sigma`."""
-    cutoff_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Bandwidth (3 dB) of a pixel at full brightness, proportional to intensity elsewhere; 0: no
-    limit."""
-    refractory_us: NonNegative = 500.0
-    noise_hz: Annotated[float, Field(ge=0, le=100)] = 0.01
-    """Noise events per second of a dark pixel."""
-    leak: Literal["events", "reference"] = "events"
-    """Effect of leakage: positive events at random times, or a steadily falling reference level,
-    which advances positive events and delays negative ones, as in v2e."""
-    leak_share: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Share of the noise that is leakage (positive, at any brightness); the rest is shot noise of
-    both polarities, which the brightest pixels have a quarter of."""
-    hot_pixels: Annotated[int, Field(ge=0, le=4096)] = 8
-    """Number of hot pixels, selected by the rig's seed."""
-    hot_hz: Annotated[float, Field(ge=0, le=1000)] = 10.0
-    """Mean event rate of a hot pixel; its events are positive."""
-    readout_hz: Annotated[float, Field(ge=0, le=10_000)] = 5000.0
-    """Read-out scans per second: an event is read in the next scan, at most one per pixel and scan.
-    At least 1000; 0: every event has its own time."""
-    scan_us: Annotated[float, Field(ge=0, le=1000)] = 192.0
-    """Time in which a scan reads its columns from left to right; an event has the read time of its
-    column. Limited to the scan period; 0: all events of a scan have its start time."""
-    block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
-    """Duration of the blocks that the camera sends, which is its latency."""
-    path: Literal["cubic", "chord"] = "cubic"
-    """Interpolation of markers between two steps of the contact: smooth, or straight."""
-
-    @rule
-    def _scans(self) -> MockEventCameraSettings:
-        if 0 < self.readout_hz < 1000:
-            raise KeyedError(
-                "mock.event_camera.readout_hz",
-                self.readout_hz,
-                "must be 0 (no scans), or 1000 to 10000 scans per second",
-            )
-        return self
-
-
-class ReflectionSettings(StrictModel):
-    """Static reflections in the acrylic, which disturb the labels.
-
-    At the default level onsets shift by a few milliseconds. Above about 40 (a quarter of the
-    contrast) the tracker mistakes reflections for markers, and labels are meaningless.
-    """
-
-    count: Annotated[int, Field(ge=0, le=100)] = 0
-    """Number of soft blobs and streaks per trial, placed by its seed; 0 for none."""
-    level: Annotated[float, Field(ge=0, le=255)] = 10.0
-    """Largest added grey level."""
-    size_mm: Positive = 3.0
-    """Approximate standard deviation along each of them."""
 
 
 Tilt = Annotated[float, Field(ge=-30, le=30)]
@@ -280,7 +206,7 @@ class MockFrameCameraSettings(StrictModel):
     ground_level: Annotated[int, Field(ge=15, le=255)] = 25
     noise: Annotated[float, Field(ge=0, le=3)] = 1.5
     """Standard deviation of the grey levels, in patches around the evaluated features."""
-    reflections: ReflectionSettings = ReflectionSettings()
+    reflections: Reflections = Reflections()
     centroid_noise_px: NonNegative = 0.0045
     """Root mean square error of a tracked papilla's column and row at the level `tracks`; measured
     at the level `video` with the settings above, along a slide."""
@@ -471,19 +397,9 @@ class MockSettings(SimulatedRig):
         return made if made is None else GripperRange(made.range_mm, made.speed_mm_s, made.force_n)
 
     @property
-    def grip_opening_mm(self) -> float | None:
-        """Opening of the gripper at which the arm's depth is the depth in contact, if any."""
-        return None if self.gripper is None else self.gripper.opening_mm
-
-    @property
     def frame_source(self) -> str:
         """Output of the outside camera: ``video`` or ``tracks``."""
         return self.frame_camera.level
-
-    @property
-    def block_ms(self) -> int:
-        """Duration of the blocks that the event camera sends."""
-        return self.event_camera.block_ms
 
     def rig_faults(self, rig: RigFile) -> Iterator[KeyedError]:
         """Return where the simulated devices are not those that the rig file states."""
@@ -505,6 +421,10 @@ class MockSettings(SimulatedRig):
         if stated.rate_hz is not None and camera.rate_hz != stated.rate_hz:
             text = f"must be mock.frame_camera.rate_hz = {camera.rate_hz:g}"
             yield KeyedError("frame_camera.rate_hz", stated.rate_hz, text)
+        block_ms, reflex = self.event_camera.block_ms, rig.reflex
+        if reflex is not None and reflex.stream_timeout * 1000 <= block_ms:
+            text = f"must be over {block_ms} ms, the camera's blocks"
+            yield KeyedError("reflex.stream_timeout", f"{reflex.stream_timeout} s", text)
         sensor = None if rig.devices is None else rig.devices.force_sensor_driver
         yield from _timing_faults(self, rig.timing, sensor is not None and sensor.of_arm)
 

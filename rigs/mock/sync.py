@@ -173,9 +173,8 @@ class ExposureLine:
         self._read += len(ticks)
         true_ns = camera.true_ns(ticks)
         exposed = np.ones(len(ticks), np.bool_)
-        for fault, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
-            if fault.device == "frame_camera":
-                exposed &= (true_ns < begin_ns) | (true_ns >= end_ns)
+        for _, begin_ns, end_ns in self._world.faults.spans(DeviceGone, target="frame_camera"):
+            exposed &= (true_ns < begin_ns) | (true_ns >= end_ns)
         edges: I64 = (true_ns + self._jitter.ns(ticks))[exposed]
         return edges
 
@@ -344,11 +343,8 @@ class _PulseFaults:
         self._box = weakref.proxy(box)  # which has its own
         self._device, self._book = device, world.faults
         self._waiting = np.empty((2, 0), np.int64)
-        doubled = [fault.device for fault in self._book.of(PulsesDuplicated)]
-        late = [fault.device for fault in self._book.of(PulsesLate)]
-        lost = [fault.device for fault in self._book.of(PulsesLost)]
-        self._reorders = device in doubled + late
-        self._whole = device not in lost and not self._reorders
+        self._reorders = bool(self._book.of(PulsesDuplicated, PulsesLate, target=device))
+        self._whole = not self._reorders and not self._book.of(PulsesLost, target=device)
 
     def of(self, ticks: I64, true_ns: I64, stamps: I64, until_ns: int) -> tuple[I64, I64]:
         """Return true times and time stamps of the reported pulses on `ticks`.
@@ -379,14 +375,13 @@ class _PulseFaults:
         """Return the ticks whose pulses have a kind of fault, and the shift, ns."""
         ticks: list[int] = []
         shift: list[int] = []
-        for fault in self._book.of(kind) if self._box.ticking else ():
-            due = self._book.due_ns(fault)
-            if fault.device == self._device and due is not None:
-                first = self._box.tick_at(due)
-                most = LONGEST_GAP_TICKS * (fault.count + 1)
-                after = np.arange(first, first + most, dtype=np.int64)
-                hit = after[self._box.bits(after) == 1][: fault.count].tolist()
-                seconds = 0.0 if isinstance(fault, PulsesLost) else fault.seconds
-                ticks += hit
-                shift += [round(seconds * 1e9)] * len(hit)
+        spans = self._book.spans(kind, target=self._device) if self._box.ticking else ()
+        for fault, due, _ in spans:
+            first = self._box.tick_at(due)
+            most = LONGEST_GAP_TICKS * (fault.count + 1)
+            after = np.arange(first, first + most, dtype=np.int64)
+            hit = after[self._box.bits(after) == 1][: fault.count].tolist()
+            seconds = 0.0 if isinstance(fault, PulsesLost) else fault.seconds
+            ticks += hit
+            shift += [round(seconds * 1e9)] * len(hit)
         return np.array(ticks, np.int64), np.array(shift, np.int64)

@@ -11,8 +11,7 @@ Discs must not come so near to each other that their edges overlap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +47,7 @@ from sliplab.rigs.scene.noise import (
     hot_places,
     noise_events,
 )
+from sliplab.rigs.scene.optics import EventOptics
 from sliplab.rigs.scene.pixels import (
     FIRE_FIELDS,
     PIXEL_FIELDS,
@@ -77,56 +77,6 @@ U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 Events = tuple[I64, U16, U16, U8]
 """True time in ns of the event or of its reading, column, row, polarity; (n,) each."""
-
-
-@dataclass(frozen=True)
-class EventOptics:
-    """The camera and its scene; fields as in `rigs.mock.settings.EventCamera`."""
-
-    width: int = 640
-    height: int = 480
-    px_per_mm: float = 14.0
-    shift_mm_per_n: float = 4.5
-    growth_mm_per_n: float = 0.4
-    radius_mm: float = 1.2
-    edge_px: float = 0.8
-    contrast: float = 2.08
-    threshold: float = 0.2
-    threshold_sigma: float = 0.03
-    threshold_off: float | None = None
-    threshold_off_sigma: float | None = None
-    cutoff_hz: float = 0.0
-    leak: Literal["events", "reference"] = "events"
-    refractory_us: float = 500.0
-    noise_hz: float = 0.01
-    leak_share: float = 0.5
-    hot_pixels: int = 8
-    hot_hz: float = 10.0
-    readout_hz: float = 5000.0
-    scan_us: float = 192.0
-    block_ms: int = 32
-    path: Literal["cubic", "chord"] = "cubic"
-
-    @property
-    def block_ns(self) -> int:
-        """Length of a block: what the camera delivers together."""
-        return self.block_ms * 1_000_000
-
-    @property
-    def period_ns(self) -> int:
-        """Time between two scans of the read-out; 0 where every event has its own time."""
-        return round(1e9 / self.readout_hz) if self.readout_hz > 0 else 0
-
-    @property
-    def has_circuit(self) -> bool:
-        """Check if pixels have more than one threshold and a memory."""
-        off = self.threshold_off is not None or self.threshold_off_sigma is not None
-        return off or self.cutoff_hz > 0 or self.leak == "reference"
-
-    @property
-    def column_ns(self) -> float:
-        """Time from one column to the next in a scan; a scan is read before the next one begins."""
-        return min(self.scan_us * 1e3, self.period_ns) / self.width
 
 
 class CameraKernel(NamedTuple):

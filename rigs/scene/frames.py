@@ -21,6 +21,7 @@ import numpy.typing as npt
 from sliplab.protocols.later import Later
 from sliplab.rigs.scene.discs import MARGIN_PX, SHIFTS, add_noise, draw_discs, draw_still
 from sliplab.rigs.scene.lens import Lens
+from sliplab.rigs.scene.optics import Reflections
 from sliplab.rigs.scene.randomness import generator, key
 from sliplab.storage.kernels import njit
 
@@ -132,15 +133,6 @@ def _patch(printed: Print, px_per_mm: float, dark: int, bright: int) -> U8:
     small = cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA)
     result: U8 = np.rint(dark + small / 255.0 * (bright - dark)).astype(np.uint8)
     return result
-
-
-@dataclass(frozen=True)
-class Reflections:
-    """Number and brightness of reflections: levels in grey values, lengths mm."""
-
-    count: int = 0
-    level: float = 10.0
-    size_mm: float = 3.0
 
 
 def draw_reflections(

@@ -11,21 +11,23 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sliplab.protocols.adapter import load_adapter
-from sliplab.protocols.adapter_parts import Markers, StreamClock
+from sliplab.protocols.adapter_parts import (
+    OWN_FORMATS,
+    Markers,
+    PoseFiles,
+    ScalarFiles,
+    StreamClock,
+    WrenchFiles,
+)
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY, ClockMap
 from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
 from sliplab.storage.formats.adapted_streams import (
     NO_ROW,
-    AdaptedEvents,
     FrameNotes,
-    SampleT,
-    TableSamples,
     read_events,
     read_frames,
-    read_poses,
-    read_scalar,
-    read_wrench,
+    read_samples,
 )
 from sliplab.storage.formats.adapted_trials import (
     EVENTS,
@@ -53,6 +55,8 @@ from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignIn
 GIVEN, UNKNOWN = "given", "unknown"
 """Grades of clocks: stated by the adapter, or not."""
 _RIG = "# Imported: there is no rig file.\nimported: adapter\n"
+_OF_EVENTS = ("event_px", "any_order", "triggers", "lost", "packets", "salvage")
+"""Attributes of a trial that come from the file of its events."""
 T = TypeVar("T")
 
 
@@ -214,8 +218,7 @@ class _Opening:
             made = replace(made, frames=lambda: self._of(FRAMES, frames()), frame_px=size)
             self._clock(parts.frames.clock, "frames")
         if parts.poses is not None and self._names(POSES):
-            read = partial(read_poses, self.found.folder, self._names(POSES)[0], parts.poses)
-            made = replace(made, poses=self._samples(POSES, POSES, self._read(POSES, read)))
+            made = replace(made, poses=self._samples(POSES, POSES, POSES, parts.poses))
             self._clock(parts.poses.clock, "arm")
         if made.salvage is not None and parts.frames is not None:
             made = replace(made, salvage=partial(_salvaged, made.salvage, made))
@@ -272,45 +275,44 @@ class _Opening:
         with self._named(stream):
             yield from chunks
 
-    def _samples(self, name: str, what: str, found: TableSamples[SampleT]) -> SampleT:
-        """Note the rows that were left out, and the resolution of the times of a table."""
+    def _samples(
+        self, name: str, key: str, what: str, part: PoseFiles | WrenchFiles | ScalarFiles
+    ) -> Any:
+        """Return the chunk of a table; note rows left out, and the resolution of its times.
+
+        Args:
+            key: of its files. what: its rows are.
+        """
+        with self._named(key):
+            found = read_samples(self.found.folder, self._names(key)[0], part)
         self.resolution_us[name] = found.resolution_us
         if found.wrong:
             self.left_out[NO_ROW.format(what)] += found.wrong
         return found.chunk
 
-    def _open_events(self) -> AdaptedEvents:
+    def _open_events(self) -> ForeignTrial:
         part = self.found.adapter.streams.events
         assert part is not None
-        here = part.format in {"counts", "csv", "numpy"}
-        paths = [] if here else self._paths(EVENTS)
+        paths = [] if part.format in OWN_FORMATS else self._paths(EVENTS)
         return read_events(self.found.folder, self._names(EVENTS), part, paths, self.salvage)
 
-    def _with_events(self, made: ForeignTrial, source: AdaptedEvents) -> ForeignTrial:
-        if source.span_us is not None:
-            self.span_ns = source.span_us[0] * 1000, source.span_us[1] * 1000
+    def _with_events(self, made: ForeignTrial, found: ForeignTrial) -> ForeignTrial:
+        """Return a trial with the content of its events' files.
+
+        Of their frames and poses, only those of which the adapter names no other file.
+        """
+        if found.whole is not None:
+            self.span_ns = found.whole(DataSpan(None, None)).span_ns
         self.clocks["events"] = DeviceRecord(grade=UNKNOWN, map=IDENTITY)
-        made = replace(
-            made, events=lambda: self._of(EVENTS, source.chunks()), event_px=source.size_px
-        )
-        foreign = source.foreign
-        if foreign is None:
-            return made
-        self.unknown += [what for what in foreign.unknown if what != "condition"]
-        made = replace(
-            made,
-            triggers=foreign.triggers,
-            lost=foreign.lost,
-            packets=foreign.packets,
-            salvage=foreign.salvage,
-        )
-        # what the same file holds besides, unless the adapter names another file of it
+        self.unknown += [what for what in found.unknown if what != "condition"]
+        same = {key: getattr(found, key) for key in _OF_EVENTS}
+        made = replace(made, events=lambda: self._of(EVENTS, found.events()), **same)
         parts = self.found.adapter.streams
-        if foreign.frames is not None and parts.frames is None:
-            made = replace(made, frames=foreign.frames, frame_px=foreign.frame_px)
+        if found.frames is not None and parts.frames is None:
+            made = replace(made, frames=found.frames, frame_px=found.frame_px)
             self._clock(None, "frames")
-        if foreign.poses is not None and parts.poses is None:
-            made = replace(made, poses=foreign.poses)
+        if found.poses is not None and parts.poses is None:
+            made = replace(made, poses=found.poses)
             self._clock(None, "arm")
         return made
 
@@ -327,20 +329,13 @@ class _Opening:
         )
 
     def _streams(self) -> dict[str, Chunk]:
-        folder, parts = self.found.folder, self.found.adapter.streams
+        parts = self.found.adapter.streams
         chunks: dict[str, Chunk] = {}
         for kind, named in (("wrenches", parts.wrenches), ("scalars", parts.scalars)):
-            for name in named:
-                if not (files := self._names(key := f"{kind}.{name}")):
-                    continue
-                rows = f"rows of {name}"
-                if kind == "wrenches":
-                    wrench = partial(read_wrench, folder, files[0], parts.wrenches[name])
-                    chunks[name] = self._samples(name, rows, self._read(key, wrench))
-                else:
-                    scalar = partial(read_scalar, folder, files[0], parts.scalars[name])
-                    chunks[name] = self._samples(name, rows, self._read(key, scalar))
-                self._clock(named[name].clock, name)
+            for name, part in named.items():
+                if self._names(key := f"{kind}.{name}"):
+                    chunks[name] = self._samples(name, key, f"rows of {name}", part)
+                    self._clock(part.clock, name)
         return chunks
 
     def _clock(self, clock: StreamClock | None, device: str) -> None:

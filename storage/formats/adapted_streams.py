@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -26,15 +28,15 @@ from sliplab.storage.formats.foreign import (
     ForeignChunk,
     ForeignTrial,
     FormatError,
+    Whole,
     event_chunk,
     resolution_us,
 )
 from sliplab.storage.formats.known import known_format
 from sliplab.storage.formats.numpy_files import MAGIC, array_of
-from sliplab.storage.formats.pictures import decode_picture, levels_of, opened_video
+from sliplab.storage.formats.pictures import decode_picture, video_frames
 from sliplab.storage.formats.recognition import read_file
-from sliplab.storage.formats.tables import read_columns, times_ns
-from sliplab.storage.formats.time_order import is_unordered
+from sliplab.storage.formats.tables import column_chunks, read_columns, times_ns
 from sliplab.storage.streams import (
     F64,
     I64,
@@ -46,9 +48,8 @@ from sliplab.storage.streams import (
     WrenchChunk,
 )
 
-SampleT = TypeVar("SampleT", PoseChunk, WrenchChunk, ScalarChunk)
-_BLOCK_CELLS = 1 << 24
-_BLOCK_EVENTS = 1 << 22
+_BLOCK_CELLS = 1 << 20
+_BLOCK_EVENTS = 1 << 18
 _FRAMES_AT_ONCE = 32
 _FEW_FRAMES = 3
 """Difference of the numbers of frames and of their times that is accepted; or a tenth."""
@@ -60,24 +61,7 @@ MOST_EVENTS = 1 << 32
 """Events that an array of counts may state."""
 
 
-@dataclass(frozen=True)
-class AdaptedEvents:
-    """Events that can be read.
-
-    Attributes:
-        chunks: in order of time.
-        size_px: columns and rows of the sensor; called once `chunks` were read.
-        span_us: begin and end of the recording, where the file says them.
-        foreign: the recording of a format that may hold more than events.
-    """
-
-    chunks: Callable[[], Iterator[EventChunk]]
-    size_px: Callable[[], tuple[int, int] | None]
-    span_us: tuple[int, int] | None = None
-    foreign: ForeignTrial | None = None
-
-
-def read_counts(array: Any, part: EventFiles) -> AdaptedEvents:
+def read_counts(array: Any, part: EventFiles) -> ForeignTrial:
     """Turn counts per time step into events.
 
     A count c in step k becomes c events at ``k step + i step / c`` for i from 0 to c - 1, cut to
@@ -125,10 +109,21 @@ def read_counts(array: Any, part: EventFiles) -> AdaptedEvents:
             total += int(counts.sum())
             if total > MOST_EVENTS:
                 raise FormatError(f"holds more than {MOST_EVENTS} events")
-            chunk = _spread(counts, first, step_us, polarity)
-            yield replace(chunk, left_out={NO_COUNT: wrong}) if wrong else chunk
+            for low, high in _parts(counts):
+                chunk = _spread(counts[low:high], first + low, step_us, polarity)
+                yield replace(chunk, left_out={NO_COUNT: wrong}) if wrong else chunk
+                wrong = 0
 
-    return AdaptedEvents(chunks, lambda: (columns, rows), (0, steps * step_us))
+    whole = Whole((0, steps * step_us * 1000))
+    size = columns, rows
+    return ForeignTrial("trial", "", chunks, "", lambda: size, whole=lambda seen: whole)
+
+
+def _parts(counts: I64) -> Iterator[tuple[int, int]]:
+    """Yield ranges of steps with about `_BLOCK_EVENTS` events each; of more, a single step."""
+    part = np.cumsum(counts.sum(axis=(1, 2, 3))) // _BLOCK_EVENTS
+    starts = np.flatnonzero(np.diff(part, prepend=-1)).tolist()
+    yield from pairwise([*starts, len(counts)])
 
 
 def _whole(counts: Any, part: EventFiles) -> tuple[I64, int]:
@@ -170,8 +165,8 @@ def read_events(
     part: EventFiles,
     paths: Sequence[Path],
     salvage: bool = False,
-) -> AdaptedEvents:
-    """Open the events of a trial.
+) -> ForeignTrial:
+    """Open the events of a trial, and what else their files hold.
 
     Args:
         names: its files; paths: them on the disk, for formats that need it.
@@ -192,15 +187,13 @@ def read_events(
         return _event_table(folder, names[0], part)
     read_files = known_format(part.format).read_files
     if read_files is not None:
-        foreign = read_files(paths, "trial")
-    else:
-        if len(paths) != 1:
-            raise FormatError(f"are {len(paths)} files for one trial")
-        foreign = read_file(part.format, paths[0], "trial", salvage)
-    return AdaptedEvents(foreign.events, foreign.event_px, None, foreign)
+        return read_files(paths, "trial")
+    if len(paths) != 1:
+        raise FormatError(f"are {len(paths)} files for one trial")
+    return read_file(part.format, paths[0], "trial", salvage)
 
 
-def _event_table(folder: DataFolder, name: str, part: EventFiles) -> AdaptedEvents:
+def _event_table(folder: DataFolder, name: str, part: EventFiles) -> ForeignTrial:
     assert part.columns is not None
     assert part.unit is not None
     columns = {
@@ -209,38 +202,38 @@ def _event_table(folder: DataFolder, name: str, part: EventFiles) -> AdaptedEven
     unit, size, positive = part.unit, part.size_px, part.positive
 
     def chunks() -> Iterator[EventChunk]:
-        found, wrong = read_columns(folder, name, part.format, columns)
-        t_us = (times_ns(found["t"], unit) + 500) // 1000
-        resolution = resolution_us(
-            found["t"], TIME_UNITS[unit] / 1000, whole_us=1e6 if unit == "s" else 0.0
-        )
-        x = _places(found["x"])
-        y = _places(found["y"]) if "y" in found else np.zeros(len(x), np.int64)
-        p = np.ones(len(x), np.int8)
-        if "p" in found:
-            if not positive:
-                _check_polarities(found["p"])
-            p[:] = np.isin(found["p"], positive) if positive else found["p"] > 0
-            p[np.isnan(found["p"])] = UNKNOWN
-        valid = t_us >= 0
-        if is_unordered(t_us[valid], p[valid] > 0):
-            order = np.argsort(t_us, kind="stable")
-            t_us, x, y, p = t_us[order], x[order], y[order], p[order]
-        for first in range(0, len(t_us), _BLOCK_EVENTS):
-            cut = slice(first, first + _BLOCK_EVENTS)
-            chunk = event_chunk(x[cut], y[cut], p[cut], t_us[cut], resolution)
-            if wrong and not first:
+        seen: list[int] = []
+        for found, wrong in column_chunks(folder, name, part.format, columns):
+            t_us = (times_ns(found["t"], unit) + 500) // 1000
+            resolution = resolution_us(
+                found["t"], TIME_UNITS[unit] / 1000, whole_us=1e6 if unit == "s" else 0.0
+            )
+            x = _places(found["x"])
+            y = _places(found["y"]) if "y" in found else np.zeros(len(x), np.int64)
+            p = np.ones(len(x), np.int8)
+            if "p" in found:
+                if not positive:
+                    _check_polarities(found["p"], seen)
+                p[:] = np.isin(found["p"], positive) if positive else found["p"] > 0
+                p[np.isnan(found["p"])] = UNKNOWN
+            chunk = event_chunk(x, y, p, t_us, resolution)
+            if wrong:
                 chunk = replace(chunk, left_out={**chunk.left_out, NO_ROW.format("events"): wrong})
             yield chunk
 
-    return AdaptedEvents(chunks, lambda: size)
+    return ForeignTrial("trial", "", chunks, "", lambda: size, any_order=True)
 
 
-def _check_polarities(values: Any) -> None:
-    """Check that integers on one side of 0 are not two polarities, such as 1 and 2."""
+def _check_polarities(values: Any, seen: list[int]) -> None:
+    """Check that integers on one side of 0 are not two polarities, such as 1 and 2.
+
+    Args:
+        seen: the lowest and highest one so far; changed.
+    """
     if values.dtype.kind not in "iu" or not len(values):
         return
-    low, high = int(values.min()), int(values.max())
+    seen.extend((int(values.min()), int(values.max())))
+    seen[:] = low, high = min(seen), max(seen)
     if low < high and (low > 0) == (high > 0):
         raise FormatError(
             f"holds polarities from {low} to {high}, {'all' if low > 0 else 'none'} above 0; "
@@ -372,17 +365,11 @@ def _images(
                 "height, width)"
             )
         return lambda: iter(array)
-
-    def from_video() -> Iterator[U8]:
-        with opened_video(paths[0]) as (video, stream):
-            for frame in video.decode(stream):
-                yield levels_of(frame)
-
-    return from_video
+    return partial(video_frames, paths[0])
 
 
 @dataclass(frozen=True)
-class TableSamples(Generic[SampleT]):
+class TableSamples:
     """Rows of a table.
 
     Attributes:
@@ -390,49 +377,39 @@ class TableSamples(Generic[SampleT]):
         wrong: number of rows that were left out because they are not all numbers.
     """
 
-    chunk: SampleT
+    chunk: PoseChunk | WrenchChunk | ScalarChunk
     resolution_us: float
     wrong: int
 
 
-def read_poses(folder: DataFolder, name: str, part: PoseFiles) -> TableSamples[PoseChunk]:
-    """Read the poses of a trial. Raises FormatError: the table cannot be right."""
-    t_ns, found, about = _samples(folder, name, part)
-    metres, radians = part.length == "m", part.angle == "rad"
-    xyz = _vectors(found, ("x", "y", "z"), len(t_ns)) * (1000.0 if metres else 1.0)
-    turned = _vectors(found, ("rx", "ry", "rz"), len(t_ns))
-    return TableSamples(
-        PoseChunk(t_ns, t_ns, xyz, np.rad2deg(turned) if radians else turned), *about
-    )
-
-
-def read_wrench(folder: DataFolder, name: str, part: WrenchFiles) -> TableSamples[WrenchChunk]:
-    """Read forces and torques. Raises FormatError: the table cannot be right."""
-    t_ns, found, about = _samples(folder, name, part)
-    force = _vectors(found, ("fx", "fy", "fz"), len(t_ns))
-    torque = _vectors(found, ("tx", "ty", "tz"), len(t_ns))
-    return TableSamples(WrenchChunk(t_ns, t_ns, force, torque), *about)
-
-
-def read_scalar(folder: DataFolder, name: str, part: ScalarFiles) -> TableSamples[ScalarChunk]:
-    """Read one quantity. Raises FormatError: the table cannot be right."""
-    t_ns, found, about = _samples(folder, name, part)
-    values = found["value"].astype(np.float64)
-    return TableSamples(ScalarChunk(t_ns, t_ns, values, part.quantity_unit), *about)
-
-
-def _samples(
+def read_samples(
     folder: DataFolder, name: str, part: PoseFiles | WrenchFiles | ScalarFiles
-) -> tuple[I64, dict[str, Any], tuple[float, int]]:
-    """Return times, ns, and columns, with the resolution of the times, us, and rows left out."""
+) -> TableSamples:
+    """Read the poses of a trial, its forces and torques, or readings of one quantity.
+
+    Raises:
+        FormatError: the table cannot be right.
+    """
     columns = {
         key: column for key, column in part.columns.model_dump().items() if column is not None
     }
     found, wrong = read_columns(folder, name, part.format, columns)
-    resolution = resolution_us(found["t"], TIME_UNITS[part.unit] / 1000)
-    return times_ns(found["t"], part.unit), found, (resolution, wrong)
+    t_ns = times_ns(found["t"], part.unit)
 
+    def vectors(*keys: str) -> F64:
+        each = [found.get(key, np.zeros(len(t_ns))) for key in keys]
+        return np.stack([np.asarray(column, np.float64) for column in each], axis=1)
 
-def _vectors(found: dict[str, Any], keys: tuple[str, str, str], rows: int) -> F64:
-    columns = [found.get(key, np.zeros(rows)) for key in keys]
-    return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    chunk: PoseChunk | WrenchChunk | ScalarChunk
+    if isinstance(part, PoseFiles):
+        xyz = vectors("x", "y", "z") * (1000.0 if part.length == "m" else 1.0)
+        turned = vectors("rx", "ry", "rz")
+        turned = np.rad2deg(turned) if part.angle == "rad" else turned
+        chunk = PoseChunk(t_ns, t_ns, xyz, turned)
+    elif isinstance(part, WrenchFiles):
+        force, torque = vectors("fx", "fy", "fz"), vectors("tx", "ty", "tz")
+        chunk = WrenchChunk(t_ns, t_ns, force, torque)
+    else:
+        values = found["value"].astype(np.float64)
+        chunk = ScalarChunk(t_ns, t_ns, values, part.quantity_unit)
+    return TableSamples(chunk, resolution_us(found["t"], TIME_UNITS[part.unit] / 1000), wrong)

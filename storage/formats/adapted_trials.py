@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.protocols.adapter import Adapter
-from sliplab.protocols.adapter_parts import BUILT_IN, SEVERAL_FILES, FieldRule
+from sliplab.protocols.adapter_parts import BUILT_IN, OWN_FORMATS, FieldRule
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
 from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
@@ -20,6 +20,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
+from sliplab.storage.formats.known import format_names, known_format
 from sliplab.storage.formats.recognition import unique_names
 from sliplab.storage.formats.tables import TableRow, read_rows
 
@@ -383,7 +384,7 @@ class _Finding:
         wanted: dict[str, tuple[str | None, bool]] = {}
         streams = self._adapter.streams
         if streams.events is not None:
-            wanted[EVENTS] = (streams.events.files, streams.events.format in SEVERAL_FILES)
+            wanted[EVENTS] = (streams.events.files, self._has_several(streams.events.format))
         if streams.frames is not None:
             wanted[FRAMES] = (streams.frames.files, streams.frames.format == "images")
             if streams.frames.times is not None:
@@ -410,6 +411,15 @@ class _Finding:
                     self._one(names, key, draft)
                 there[stream] = names
         return files
+
+    def _has_several(self, name: str) -> bool:
+        """Return whether a trial may have more than one file of a format of events."""
+        if name in OWN_FORMATS:
+            return False
+        if name not in format_names():
+            known = ", ".join((*OWN_FORMATS, *format_names()))
+            raise self._error("streams.events.format", name, f"must be one of {known}")
+        return known_format(name).read_files is not None
 
     def _warn_of_missing(self, trials: list[AdaptedTrial]) -> None:
         counts = Counter(key for trial in trials for key in trial.missing)

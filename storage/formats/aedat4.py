@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.later import Later
+from sliplab.storage.formats.exported import event_size, has_events, recorded_triggers
 from sliplab.storage.formats.flatbuffers import (
     GREY,
     FlatTable,
@@ -37,12 +38,15 @@ from sliplab.storage.formats.foreign import (
     FormatError,
     Triggers,
     as_damage,
+    empty_events,
     event_chunk,
     grey,
 )
+from sliplab.storage.formats.format import Format
 from sliplab.storage.kernels import njit
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.streams import I64, U8, U16, EventChunk, FrameChunk
+from sliplab.storage.trials.recording import Recording
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -187,7 +191,7 @@ class Aedat4File:
     def _inside(self, number: int) -> Iterator[EventChunk]:
         for data in self._packets(number):
             words = _event_words(data)
-            yield _split(words, _empty(len(words) // 2))
+            yield _split(words, empty_events(len(words) // 2))
 
     def _lost(self, kind: str) -> int | None:
         """Return the items of a stream behind the end, by the table that closes a whole file."""
@@ -214,28 +218,28 @@ class Aedat4File:
 
         A camera's packet has a few hundred events: the overhead per chunk would exceed their cost.
         """
-        room = _empty(_PACKET_EVENTS)
+        room = empty_events(_PACKET_EVENTS)
         filled = 0
         for data in self._packets(number):
             words = _event_words(data)
             count = len(words) // 2
             if filled and filled + count > len(room):
-                yield _part(room, 0, filled)
+                yield room[:filled]
                 filled = 0
-                room = _empty(_PACKET_EVENTS)
+                room = empty_events(_PACKET_EVENTS)
             if count > len(room):
-                room = _empty(count)
-            found = _split(words, _part(room, filled, filled + count))
+                room = empty_events(count)
+            found = _split(words, room[filled : filled + count])
             if len(found) == count:
                 filled += count
                 continue
             if filled:
-                yield _part(room, 0, filled)
+                yield room[:filled]
                 filled = 0
-                room = _empty(_PACKET_EVENTS)
+                room = empty_events(_PACKET_EVENTS)
             yield found
         if filled:
-            yield _part(room, 0, filled)
+            yield room[:filled]
 
     def triggers(self, number: int) -> Triggers:
         """Return all triggers of a stream."""
@@ -371,19 +375,6 @@ def _split_events(words: npt.NDArray[np.uint64], x: U16, y: U16, p: U8, t: I64) 
     return not wrong
 
 
-def _empty(count: int) -> EventChunk:
-    return EventChunk(
-        np.empty(count, np.uint16),
-        np.empty(count, np.uint16),
-        np.empty(count, np.uint8),
-        np.empty(count, np.int64),
-    )
-
-
-def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    return chunk[low:high]
-
-
 def _length(data: bytes, most: int) -> int:
     count = int(struct.unpack("<I", data)[0])
     if count > most:
@@ -446,7 +437,7 @@ class Aedat4Writer:
     def events(self, number: int, chunk: EventChunk) -> None:
         """Append events; times must not run backwards, over all calls."""
         for start in range(0, len(chunk), _PACKET_EVENTS):
-            self._write(number, events_buffer(_part(chunk, start, start + _PACKET_EVENTS)))
+            self._write(number, events_buffer(chunk[start : start + _PACKET_EVENTS]))
 
     def triggers(self, number: int, found: Triggers) -> None:
         """Append triggers."""
@@ -543,3 +534,43 @@ def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignT
         about={"camera": streams[main].source, "left_out": left_out},
         unknown=("sync grade", "poses", "motion", "condition"),
     )
+
+
+def _export(recording: Recording, path: Path, stream: str) -> dict[str, int]:
+    """Write everything on the event camera's clock, us; frames at the middle of their exposure."""
+    if not (has_events(recording, stream) or recording.has_video):
+        raise ValueError("has neither events nor a video, and AEDAT4 holds those alone")
+    source = f"sliplab {SIMULATED}" if recording.simulated else "sliplab"
+    triggers = recorded_triggers(recording, stream)
+    streams = {0: Aedat4Stream(EVENTS, "events", event_size(recording, stream), source)}
+    frame_us = np.empty(0, np.int64)
+    if recording.has_video:
+        frame_us = recording.frame_times() // 1000
+        if has_events(recording, stream):
+            frame_us = recording.clock(stream).to_device(recording.frame_times()) // 1000
+        first = recording.frame(0) if len(frame_us) else np.empty((1, 1))
+        height, width = first.shape
+        streams[1] = Aedat4Stream(FRAMES, "frames", (width, height), source)
+    streams[2] = Aedat4Stream(TRIGGERS, "triggers", None, source)
+    if len(frame_us) and int(frame_us.min()) < 0:
+        raise ValueError("has frames before the event camera's clock started")
+    with Aedat4Writer(path, streams) as file:
+        count = 0
+        with recording.open(stream) as reader:
+            for chunk in reader.event_chunks():
+                file.events(0, chunk)
+                count += len(chunk)
+        file.triggers(2, triggers)
+        if recording.has_video:
+            for image, t_us in zip(recording.frames(), frame_us.tolist(), strict=True):
+                file.picture(1, image, t_us)
+    return {"events": count, "frames": len(frame_us), "triggers": len(triggers.t_us)}
+
+
+AEDAT4 = Format(
+    (".aedat4",),
+    lambda path, head: head.startswith(LINE),
+    read_aedat4,
+    salvage_aedat4,
+    export=_export,
+)

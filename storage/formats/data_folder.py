@@ -19,6 +19,7 @@ from sliplab.protocols.file_pattern import FilePattern
 from sliplab.protocols.recorded import natural
 from sliplab.storage.files import scratch_folder
 from sliplab.storage.formats.foreign import Skipped
+from sliplab.storage.formats.numpy_files import unpacked
 
 MOST_FILES = 2_000_000
 MOST_BYTES = 1 << 31
@@ -141,7 +142,7 @@ class DataFolder:
         except (OSError, ValueError) as error:
             raise InputError(path, "", None, f"cannot be read: {error}") from None
 
-    def _unpack(self, item: ZipInfo) -> bytes:
+    def _unpack(self, item: ZipInfo) -> Any:
         assert self._zip is not None
         where = self.place(item.filename)
         if item.file_size > MOST_BYTES:
@@ -149,10 +150,7 @@ class DataFolder:
                 where, "", None, f"holds more than {MOST_BYTES >> 20} MiB; unpack the zip first"
             )
         try:
-            with self._zip.open(item) as file:
-                return file.read(item.file_size)
-        except (BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError) as error:
-            raise InputError(where, "", None, f"cannot be unpacked: {error}") from None
+            return unpacked(self._zip, item)
         except Exception as error:  # zlib and lzma have their own errors
             raise InputError(where, "", None, f"cannot be unpacked: {error}") from None
 

@@ -7,9 +7,10 @@ of the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
+from sliplab.storage.formats.exported import has_events, recorded_triggers
 from sliplab.storage.formats.foreign import (
     LATEST_US,
     Damage,
@@ -29,75 +31,131 @@ from sliplab.storage.formats.foreign import (
     resolution_us,
     rounded_us,
 )
-from sliplab.storage.formats.time_order import is_unordered
+from sliplab.storage.formats.format import Format
 from sliplab.storage.schema.trial import Lost
-from sliplab.storage.streams import I64, EventChunk
+from sliplab.storage.streams import I64, EventChunk, Json
 from sliplab.storage.trials.hdf5_reader import FileContent, Hdf5Column, RowFile
+from sliplab.storage.trials.hdf5_writer import CACHE_BYTES
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.superblock import SIGNATURE
 
-PIECE = 1 << 20
+PIECE = 1 << 18
+"""Events that are read at once."""
 _SUPERBLOCK, _FLAGS = 52, 12
 """Bytes of a superblock, and of its beginning up to its flags."""
 _FEW_ROWS = 1 << 12
-_LAB = ("xs", "ys", "ps", "ts")
 _MOST_PACKED = 2000
 """Rows a byte of the file: what columns of equal values are packed to."""
-_MOST_UNSORTED = 1 << 28
+_DSEC_TYPES = {"x": np.uint16, "y": np.uint16, "p": np.uint8, "t": np.uint32}
 _LAYOUTS = "dsec has events/x, y, p and t, lab-hdf5 has events/xs, ys, ps and ts"
 _FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError, AttributeError)
 
 
-def read_dsec(path: Path, name: str) -> ForeignTrial:
-    """Read a file with ``events/{x,y,p,t}`` in us and an optional ``t_offset``.
+Rows = Callable[[str], Hdf5Column]
+"""Opens a column of plain numbers by its name."""
+Columns = Mapping[str, Hdf5Column]
 
-    Raises:
-        FormatError: it is damaged, or has another layout.
+
+@dataclass(frozen=True)
+class _Layout:
+    """Layout of events in an HDF5 file.
+
+    Attributes:
+        keys: columns below ``events``: columns, rows, polarities and times.
+        events: makes events of rows of these columns and an offset of the times, us.
+        offset: reads that offset.
+        properties: reads further attributes of the trial from a file, a function that opens its
+            columns, those below ``events``, and the number of their rows; if the last argument is
+            true, the file is damaged, and what cannot be read is left out.
     """
-    with _opened(path) as (file, rows):
-        columns = {key: rows(f"events/{key}") for key in "xypt"}
-        _same_length(columns)
-        with as_damage():
-            offset = _offset(file)
-            triggers = _triggers(file, rows)
-        simulated = bool(file.attribute("simulated", 0))
-    count = len(columns["t"])
 
-    def all_events() -> Iterator[EventChunk]:
-        with _opened(path) as (_, again):
-            found = {key: again(f"events/{key}") for key in "xypt"}
-            for low in range(0, count, PIECE):
-                yield _dsec_events(found, offset, low, low + PIECE)
+    keys: tuple[str, str, str, str]
+    events: Callable[[Any, Any, Any, Any, int], EventChunk]
+    offset: Callable[[RowFile], int]
+    properties: Callable[[RowFile, Rows, Columns, int, bool], Json]
 
-    return _dsec_trial(path, name, all_events, triggers, simulated)
+    def read(self, path: Path, name: str) -> ForeignTrial:
+        """Read a file of the layout.
+
+        Raises:
+            FormatError: it is damaged, or has another layout.
+        """
+        with _opened(path) as (file, rows):
+            columns = self._columns(rows)
+            _same_length(columns)
+            count = min(map(len, columns.values()))
+            with as_damage():
+                offset = self.offset(file)
+                found = self.properties(file, rows, columns, count, False)
+        return self._trial(path, name, count, offset, found)
+
+    def salvage(self, path: Path, name: str) -> ForeignTrial:
+        """Read the events before the first piece of a column that cannot be read.
+
+        Raises:
+            FormatError: the description of its columns is damaged, or it has another layout.
+        """
+        with _opened(path, torn=True) as (file, rows):
+            columns = self._columns(rows)
+            offset = self.offset(file)
+            count, lost = _whole_rows(path, columns, partial(self._chunk, columns, offset))
+            found = self.properties(file, rows, columns, count, True)
+        return self._trial(path, name, count, offset, {**found, "lost": lost}, torn=True)
+
+    def _columns(self, rows: Rows) -> Columns:
+        return {key: rows(f"events/{key}") for key in self.keys}
+
+    def _chunk(self, columns: Columns, offset: int, low: int, high: int) -> EventChunk:
+        x, y, p, t = (column.read(low, high) for column in columns.values())
+        return self.events(x, y, p, t, offset)
+
+    def _trial(
+        self, path: Path, name: str, count: int, offset: int, found: Json, *, torn: bool = False
+    ) -> ForeignTrial:
+        def all_events() -> Iterator[EventChunk]:
+            with _opened(path, torn=torn) as (_, rows):
+                columns = self._columns(rows)
+                for low in range(0, count, PIECE):
+                    yield self._chunk(columns, offset, low, min(low + PIECE, count))
+
+        return ForeignTrial(name, path.name, all_events, notes=_open_note(path), **found)
 
 
-def salvage_dsec(path: Path, name: str) -> ForeignTrial:
-    """Read the events before the first piece of a column that cannot be read.
+def _dsec_properties(file: RowFile, rows: Rows, columns: Columns, count: int, torn: bool) -> Json:
+    triggers = None
+    try:
+        triggers = _triggers(file, rows)
+    except (FormatError, *_FAULTS):
+        if not torn:
+            raise
+    return {
+        "epoch": "the event camera's own clock, us",
+        "triggers": triggers,
+        "simulated": bool(file.attribute("simulated", 0)),
+        "unknown": ("sync grade", "poses", "motion", "condition", "frames"),
+    }
 
-    Raises:
-        FormatError: the description of its columns is damaged, or it has another layout.
-    """
-    with _opened(path, torn=True) as (file, rows):
-        columns = {key: rows(f"events/{key}") for key in "xypt"}
-        offset = _offset(file)
-        simulated = bool(file.attribute("simulated", 0))
-        try:
-            triggers = _triggers(file, rows)
-        except (FormatError, *_FAULTS):
-            triggers = None
 
-        def check(low: int, high: int) -> EventChunk:
-            return _dsec_events(columns, offset, low, high)
+def _dsec_events(x: Any, y: Any, p: Any, t: Any, offset: int) -> EventChunk:
+    return event_chunk(x, y, _polarities(p), _integers(t) + offset)
 
-        count, lost = _whole_rows(path, columns, check)
 
-    def all_events() -> Iterator[EventChunk]:
-        with _opened(path, torn=True) as (_, again):
-            found = {key: again(f"events/{key}") for key in "xypt"}
-            for low in range(0, count, PIECE):
-                yield _dsec_events(found, offset, low, min(low + PIECE, count))
+def _lab_properties(file: RowFile, rows: Rows, columns: Columns, count: int, torn: bool) -> Json:
+    size = _resolution(file.integers("sensor_resolution"), columns, count)
+    return {
+        "epoch": "unknown; seconds as the file has them, rounded to us",
+        "event_px": lambda: size,
+        "unknown": (
+            *("epoch", "sync grade", "poses", "motion", "condition", "frames"),
+            "polarity map",
+        ),
+        "any_order": True,
+    }
 
-    return replace(_dsec_trial(path, name, all_events, triggers, simulated), lost=lost)
+
+def _lab_events(x: Any, y: Any, p: Any, t: Any, offset: int) -> EventChunk:
+    step_us = resolution_us(t, 1e6, whole_us=1e6)
+    return event_chunk(_pixels(x), _pixels(y), _polarities(p), rounded_us(t, 1e6), step_us)
 
 
 def _offset(file: RowFile) -> int:
@@ -110,7 +168,7 @@ def _offset(file: RowFile) -> int:
     return offset
 
 
-def _triggers(file: RowFile, rows: Callable[[str], Hdf5Column]) -> Triggers | None:
+def _triggers(file: RowFile, rows: Rows) -> Triggers | None:
     if not file.has("triggers/t"):
         return None
     kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
@@ -118,85 +176,6 @@ def _triggers(file: RowFile, rows: Callable[[str], Hdf5Column]) -> Triggers | No
     if len(found.t_us) != len(kinds):
         raise FormatError("holds triggers whose columns have different lengths")
     return found
-
-
-def _dsec_events(columns: Mapping[str, Hdf5Column], offset: int, low: int, high: int) -> EventChunk:
-    x, y, p, t = (columns[key].read(low, high) for key in "xypt")
-    return event_chunk(x, y, _polarities(p), _integers(t) + offset)
-
-
-def _dsec_trial(
-    path: Path,
-    name: str,
-    events: Callable[[], Iterator[EventChunk]],
-    triggers: Triggers | None,
-    simulated: bool,
-) -> ForeignTrial:
-    return ForeignTrial(
-        name,
-        path.name,
-        events,
-        "the event camera's own clock, us",
-        triggers=triggers,
-        simulated=simulated,
-        unknown=("sync grade", "poses", "motion", "condition", "frames"),
-        notes=_open_note(path),
-    )
-
-
-def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
-    """Read the lab's file with ``events/{ps,ts,xs,ys}``: float seconds, in any order.
-
-    Raises:
-        FormatError: it is damaged, or has another layout.
-    """
-    with _opened(path) as (file, rows):
-        columns = {key: rows(f"events/{key}") for key in _LAB}
-        _same_length(columns)
-        count = len(columns["ts"])
-        if count > _MOST_UNSORTED:
-            raise FormatError(f"holds {count} events, too many events to sort")
-        with as_damage():
-            size = _resolution(file.integers("sensor_resolution"), columns, count)
-
-    def all_events() -> Iterator[EventChunk]:
-        with _opened(path) as (_, again):
-            yield _sorted(*_lab_events({key: again(f"events/{key}") for key in _LAB}, 0, count))
-
-    return _lab_trial(path, name, all_events, size)
-
-
-def salvage_lab_hdf5(path: Path, name: str) -> ForeignTrial:
-    """Read the rows before the first piece of a column that cannot be read, and sort them.
-
-    Raises:
-        FormatError: the description of its columns is damaged, or it has another layout.
-    """
-    with _opened(path, torn=True) as (file, rows):
-        columns = {key: rows(f"events/{key}") for key in _LAB}
-
-        def check(low: int, high: int) -> EventChunk:
-            return _sorted(*_lab_events(columns, low, high))
-
-        count, lost = _whole_rows(path, columns, check)
-        if count > _MOST_UNSORTED:
-            raise FormatError(f"holds {count} events, too many events to sort")
-        size = _resolution(file.integers("sensor_resolution"), columns, count)
-
-    def all_events() -> Iterator[EventChunk]:
-        with _opened(path, torn=True) as (_, again):
-            yield _sorted(*_lab_events({key: again(f"events/{key}") for key in _LAB}, 0, count))
-
-    return replace(_lab_trial(path, name, all_events, size), lost=lost)
-
-
-def _lab_events(
-    columns: Mapping[str, Hdf5Column], low: int, high: int
-) -> tuple[I64, I64, Any, I64, float]:
-    """Return columns, rows, polarities, times and their resolution, us, as the file orders them."""
-    xs, ys, ps, ts = (columns[key].read(low, high) for key in _LAB)
-    step_us = resolution_us(ts, 1e6, whole_us=1e6)
-    return _pixels(xs), _pixels(ys), _polarities(ps), rounded_us(ts, 1e6), step_us
 
 
 def _polarities(values: Any) -> Any:
@@ -207,31 +186,7 @@ def _polarities(values: Any) -> Any:
     return np.select([np.isin(found, (1, 255)), np.isin(found, (0, -1))], [1, 0], 2)
 
 
-def _sorted(x: I64, y: I64, p: Any, t_us: I64, resolution: float) -> EventChunk:
-    chunk = event_chunk(x, y, p, t_us, resolution)
-    if not is_unordered(chunk.t_us, chunk.p > 0):
-        return chunk
-    return chunk[np.argsort(chunk.t_us, kind="stable")]
-
-
-def _lab_trial(
-    path: Path,
-    name: str,
-    events: Callable[[], Iterator[EventChunk]],
-    size: tuple[int, int] | None,
-) -> ForeignTrial:
-    return ForeignTrial(
-        name,
-        path.name,
-        events,
-        "unknown; seconds as the file has them, rounded to us",
-        lambda: size,
-        unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
-        notes=_open_note(path),
-    )
-
-
-def _piece(columns: Mapping[str, Hdf5Column]) -> int:
+def _piece(columns: Columns) -> int:
     """Return the rows that are read or lost together: a chunk of the column of times."""
     *_, times = columns.values()
     starts = (low for low, *_ in times.stored())
@@ -243,7 +198,7 @@ def _piece(columns: Mapping[str, Hdf5Column]) -> int:
 
 def _whole_rows(
     path: Path,
-    columns: Mapping[str, Hdf5Column],
+    columns: Columns,
     check: Callable[[int, int], object],
 ) -> tuple[int, Lost | None]:
     """Return the number of rows before the first that cannot be read in all columns.
@@ -302,9 +257,7 @@ def _unread(column: Hdf5Column, count: int, size: int) -> Iterator[tuple[int, in
             yield place, min(length, size - place)
 
 
-def _resolution(
-    stated: list[int] | None, of: Mapping[str, Hdf5Column], count: int
-) -> tuple[int, int] | None:
+def _resolution(stated: list[int] | None, of: Columns, count: int) -> tuple[int, int] | None:
     """Return columns and rows of the camera, by the attribute `sensor_resolution`.
 
     The lab writes columns first, other programs that share its layout rows first. Sensors are wider
@@ -330,55 +283,63 @@ def _same_length(columns: Mapping[str, Sized]) -> None:
         raise FormatError(f"its events' columns have different lengths: {stated}")
 
 
-def is_lab_hdf5(path: Path) -> bool:
-    """Return whether a file has the lab's names of columns.
-
-    Raises:
-        FormatError: it cannot be opened.
-    """
-    with _opened(path, torn=True) as (file, _):
-        return bool(file.has("events/ts"))
-
-
 def write_dsec(
-    path: Path, events: EventChunk, triggers: Triggers | None, *, simulated: bool
-) -> None:
+    path: Path, chunks: Iterable[EventChunk], triggers: Triggers | None, *, simulated: bool
+) -> int:
     """Write events in DSEC's layout: Blosc and zstd, ``t`` in 32 bits after ``t_offset``, us.
+
+    Args:
+        chunks: events in order of time; each is written before the next one is read.
+
+    Returns:
+        Number of events.
 
     Raises:
         ValueError: the recording is longer than 32 bits of microseconds (71.6 min).
     """
-    offset = int(events.t_us[0]) if len(events) else 0
-    times = events.t_us - offset
-    if len(times) and int(times[-1]) >= 1 << 32:
-        raise ValueError("is longer than 71.6 min, which DSEC's 32-bit times cannot represent")
     packing = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)
-    with h5py.File(path, "w") as file:
+    count = offset = next_ms = 0
+    with h5py.File(path, "w", rdcc_nbytes=CACHE_BYTES) as file:
         file.attrs["simulated"] = np.int64(simulated)
 
-        def put(name: str, values: Any) -> None:
-            file.create_dataset(
-                name,
-                data=values,
-                chunks=(1 << 16,) if len(values) else None,
-                maxshape=(None,) if len(values) else None,
-                **(packing if len(values) else {}),
+        def column(name: str, dtype: Any) -> Any:
+            return file.create_dataset(
+                name, (0,), dtype, maxshape=(None,), chunks=(1 << 16,), **packing
             )
 
-        put("events/x", events.x)
-        put("events/y", events.y)
-        put("events/p", events.p)
-        put("events/t", times.astype(np.uint32))
-        last_ms = int(times[-1]) // 1000 + 1 if len(times) else 0
-        put("ms_to_idx", np.searchsorted(times, np.arange(last_ms + 1) * 1000).astype(np.uint64))
+        events = {key: column(f"events/{key}", dtype) for key, dtype in _DSEC_TYPES.items()}
+        index = column("ms_to_idx", np.uint64)
+        for chunk in chunks:
+            if not len(chunk):
+                continue
+            offset = offset if count else int(chunk.t_us[0])
+            times = chunk.t_us - offset
+            if int(times[-1]) >= 1 << 32:
+                raise ValueError(
+                    "is longer than 71.6 min, which DSEC's 32-bit times cannot represent"
+                )
+            marks = np.arange(next_ms, int(times[-1]) // 1000 + 1) * 1000
+            _append(index, count + np.searchsorted(times, marks))
+            for key, values in {"x": chunk.x, "y": chunk.y, "p": chunk.p, "t": times}.items():
+                _append(events[key], values)
+            next_ms, count = next_ms + len(marks), count + len(chunk)
+        _append(index, np.full(1, count))  # so that the last millisecond has an end
         file["t_offset"] = np.int64(offset)
         if triggers is not None:
-            put("triggers/t", triggers.t_us)
-            put("triggers/kind", triggers.kind)
+            _append(column("triggers/t", np.int64), triggers.t_us)
+            _append(column("triggers/kind", np.uint8), triggers.kind)
+    return count
+
+
+def _append(column: Any, values: Any) -> None:
+    """Add rows to an `h5py.Dataset`."""
+    start = len(column)
+    column.resize((start + len(values),))
+    column[start:] = values
 
 
 class _opened:
-    """An open file and its columns of plain numbers; its faults become `FormatError`.
+    """An open file, and the function that opens its columns; its faults become `FormatError`.
 
     Args:
         torn: open truncated files, too, with zeros in place of missing data.
@@ -388,7 +349,7 @@ class _opened:
         self._path, self._torn = path, torn
         self._padded: FileContent | None = None
 
-    def __enter__(self) -> tuple[RowFile, Callable[[str], Hdf5Column]]:
+    def __enter__(self) -> tuple[RowFile, Rows]:
         size = self._path.stat().st_size
         try:
             end = _stated_end(self._path)
@@ -469,3 +430,33 @@ def _pixels(values: Any) -> I64:
         with np.errstate(invalid="ignore"):
             found = np.where(found == np.rint(found), np.clip(found, -1, 1 << 20), -1)
     return found.astype(np.int64)
+
+
+def _export(recording: Recording, path: Path, stream: str) -> dict[str, int]:
+    """Write events and triggers; DSEC's event file holds no frames."""
+    if not has_events(recording, stream):
+        raise ValueError("has no events, and DSEC's file holds those alone")
+    triggers = recorded_triggers(recording, stream)
+    with recording.open(stream) as reader:
+        count = write_dsec(path, reader.event_chunks(), triggers, simulated=recording.simulated)
+    return {"events": count, "frames": 0, "triggers": len(triggers.t_us)}
+
+
+def _sniff(path: Path, head: bytes, *, lab: bool) -> bool:
+    """Return whether a file is of the layout; a damaged one may be of both."""
+    if not head.startswith(SIGNATURE):
+        return False
+    try:
+        with _opened(path, torn=True) as (file, _):
+            return file.has("events/ts") == lab
+    except FormatError:  # its reader finds the same fault
+        return True
+
+
+_DSEC = _Layout(("x", "y", "p", "t"), _dsec_events, _offset, _dsec_properties)
+_LAB = _Layout(("xs", "ys", "ps", "ts"), _lab_events, lambda file: 0, _lab_properties)
+_ENDINGS = (".h5", ".hdf5")
+DSEC = Format(_ENDINGS, partial(_sniff, lab=False), _DSEC.read, _DSEC.salvage, export=_export)
+"""Files with ``events/{x,y,p,t}`` in us and an optional ``t_offset``."""
+LAB_HDF5 = Format(_ENDINGS, partial(_sniff, lab=True), _LAB.read, _LAB.salvage)
+"""The lab's files with ``events/{ps,ts,xs,ys}``: float seconds, in any order."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -95,6 +95,26 @@ def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
             continue
         rows.append({"campaign": campaign, "trial": trial, **_flat(found, "")})
     return pd.DataFrame(rows).convert_dtypes()
+
+
+def sample_table(recordings: Iterable[Recording], stream: str) -> pd.DataFrame:
+    """Return one row a sample of a stream: its trial, its time on the time line (ns), its values.
+
+    Values with several components become columns with a number in their names.
+
+    Raises:
+        StoreError: a trial has no such stream.
+    """
+    tables = []
+    for recording in recordings:
+        samples = recording.samples(stream)
+        times = samples.pop("t")
+        columns: Json = {"trial": recording.trial_id, "t_ns": times}
+        for part, values in samples.items():
+            for index, component in enumerate(values.reshape(len(times), -1).T):
+                columns[part if values.ndim == 1 else f"{part}_{index}"] = component
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _flat(data: Json, before: str) -> Json:

@@ -13,7 +13,6 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats.time_order import in_order
 from sliplab.storage.schema.trial import DeviceRecord, Given, Lost, MotionStep, StreamCounts
 from sliplab.storage.streams import (
     I64,
@@ -188,7 +187,8 @@ class ForeignTrial:
 
     Attributes:
         name: its id in the store.
-        events: its events, in order of time but for faults; read again by each call.
+        events: its events as the file lists them; read again by each call.
+        any_order: the file may list them in another order than that of their times.
         event_px: columns and rows of its camera, None if unknown; called once `events` were read.
         epoch: what the times count from, as text.
         about: further properties in the file, to be stored in the record.
@@ -243,6 +243,7 @@ class ForeignTrial:
     geometry: Json = field(default_factory=dict)
     whole: Callable[[DataSpan], Whole] | None = None
     error: FormatError | InputError | None = None
+    any_order: bool = False
 
 
 def broken(name: str, source: str, error: FormatError | InputError) -> ForeignTrial:
@@ -254,40 +255,6 @@ def refusal(file: Path, error: FormatError) -> InputError:
     """Return the error of a file that is not imported: bad data, or else wrong input."""
     kind = DamagedFile if isinstance(error, Damage) else InputError
     return kind(file, error.key, None, str(error))
-
-
-def before_damage(
-    read: Callable[[], ForeignTrial], error: FormatError, salvage: bool
-) -> ForeignTrial:
-    """Return the intact part of a file that could not be read.
-
-    Args:
-        error: the fault that was found.
-
-    Raises:
-        Damage: there is no intact part, or it may not be salvaged, and is only offered.
-        FormatError: the fault is no damage.
-    """
-    try:
-        whole = read()
-        if whole.lost is None:
-            raise error
-        if salvage:
-            return whole
-        chunks = (inside(chunk, whole.event_px()) for chunk in whole.events())
-        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in chunks)]
-        times = np.concatenate(parts)
-        times = times[in_order(times)]
-    except FormatError as fault:
-        if fault is error:
-            raise
-        worse = fault if isinstance(fault, Damage) else error
-        raise Damage(str(worse), error.file) from None
-    if not len(times):
-        raise Damage(f"{error}; there is no event before that", error.file)
-    packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
-    offer = f"--salvage imports {len(times):,} events up to {times[-1]} us{packets}"
-    raise Damage(f"{error}; {offer}", error.file)
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -> ForeignChunk:
@@ -335,6 +302,16 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -
         np.ascontiguousarray(columns[3], np.int64),
         left_out,
         resolution_us,
+    )
+
+
+def empty_events(count: int) -> EventChunk:
+    """Return a chunk with room for some events."""
+    return EventChunk(
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint8),
+        np.empty(count, np.int64),
     )
 
 

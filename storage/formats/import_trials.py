@@ -15,6 +15,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,7 @@ from sliplab.protocols.key_errors import faults_of
 from sliplab.protocols.shown import plural
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.files import json_text, safe_name
+from sliplab.storage.formats.by_time import by_time
 from sliplab.storage.formats.foreign import (
     LATEST_US,
     NO_TIME,
@@ -41,11 +43,11 @@ from sliplab.storage.formats.foreign import (
     NoEvents,
     Whole,
     as_damage,
-    before_damage,
     inside,
     left_out_of,
     refusal,
 )
+from sliplab.storage.formats.recognition import before_damage
 from sliplab.storage.formats.time_order import Mask, falls, in_order
 from sliplab.storage.interrupts import interruptible, uninterrupted
 from sliplab.storage.process import now
@@ -388,6 +390,7 @@ def _take_whole(
     trial = replace(
         trial,
         events=whole.events,
+        any_order=whole.any_order,
         event_px=whole.event_px,
         triggers=whole.triggers,
         frames=whole.frames,
@@ -412,7 +415,10 @@ def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _
     try:
         return _write(campaign, trial, kind, _Content())
     except _RunsBack:
-        return _write(campaign, trial, kind, _Content(_orders(trial)))
+        if not trial.any_order:
+            return _write(campaign, trial, kind, _Content(_orders(trial)))
+    sorted_ = replace(trial, events=partial(by_time, trial.events), any_order=False)
+    return _take(store, campaign, sorted_, kind)
 
 
 def _orders(trial: ForeignTrial) -> dict[str, Mask]:

@@ -8,41 +8,11 @@ from functools import cache
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
-from sliplab.storage.formats.aedat4 import LINE, read_aedat4, salvage_aedat4
-from sliplab.storage.formats.dsec import (
-    read_dsec,
-    read_lab_hdf5,
-    salvage_dsec,
-    salvage_lab_hdf5,
-)
+from sliplab.storage.formats.aedat4 import AEDAT4
+from sliplab.storage.formats.dsec import DSEC, LAB_HDF5
 from sliplab.storage.formats.format import Format, Layout
-from sliplab.storage.formats.writers import export_aedat4, export_dsec
-from sliplab.storage.trials.superblock import SIGNATURE
 
-DSEC, LAB_HDF5 = "dsec", "lab-hdf5"
-_HDF5 = (".h5", ".hdf5")
-CORE = {
-    "aedat4": Format(
-        suffixes=(".aedat4",),
-        sniff=lambda path, head: head.startswith(LINE),
-        read=read_aedat4,
-        salvage=salvage_aedat4,
-        export=export_aedat4,
-    ),
-    DSEC: Format(
-        suffixes=_HDF5,
-        sniff=lambda path, head: head.startswith(SIGNATURE),
-        read=read_dsec,
-        salvage=salvage_dsec,
-        export=export_dsec,
-    ),
-    LAB_HDF5: Format(
-        suffixes=_HDF5,
-        sniff=lambda path, head: head.startswith(SIGNATURE),
-        read=read_lab_hdf5,
-        salvage=salvage_lab_hdf5,
-    ),
-}
+CORE = {"aedat4": AEDAT4, "dsec": DSEC, "lab-hdf5": LAB_HDF5}
 """Formats of the core, by name."""
 
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import io
 import math
+import mmap
+import shutil
 import warnings
+from pathlib import Path
+from tempfile import TemporaryFile
 from tokenize import TokenError
 from typing import Any
-from zipfile import ZipFile
+from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 
@@ -16,6 +20,7 @@ from sliplab.storage.formats.foreign import FormatError
 MAGIC = np.lib.format.MAGIC_PREFIX
 ZIP_MAGIC = b"PK\x03\x04"
 _HEAD_BYTES = 1 << 16
+_FEW_BYTES = 1 << 20
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -68,19 +73,43 @@ def array_of(data: Any) -> Any:
     return numbers.reshape(shape, order="F" if fortran else "C")
 
 
-def arrays_of(data: Any, most_bytes: int) -> dict[str, Any]:
-    """Return the arrays in the bytes of an ``.npz`` file by name.
+def arrays_of(path: Path, most_bytes: int) -> dict[str, Any]:
+    """Return the arrays of an ``.npz`` file by name.
 
     Raises:
         FormatError: as `array_of`, or they are larger than `most_bytes` together.
     """
     try:
-        with ZipFile(io.BytesIO(bytes(data))) as packed:
+        with ZipFile(path) as packed:
             items = [item for item in packed.infolist() if item.filename.endswith(".npy")]
             if sum(item.file_size for item in items) > most_bytes:
                 raise FormatError(f"holds more than {most_bytes >> 20} MiB")
-            return {item.filename[:-4]: array_of(packed.read(item)) for item in items}
+            return {item.filename[:-4]: array_of(unpacked(packed, item)) for item in items}
     except FormatError:
         raise
     except Exception as error:  # zlib and lzma have their own errors
         raise FormatError(f"is a damaged .npz file ({error})") from None
+
+
+def unpacked(packed: ZipFile, item: ZipInfo) -> Any:
+    """Return the bytes of a file in a zip, mapped from a temporary file if there are many.
+
+    Raises:
+        Exception: it is damaged; the libraries of its compressions have their own errors.
+    """
+    with packed.open(item) as source:
+        if item.file_size <= _FEW_BYTES:
+            return source.read(item.file_size)
+        with TemporaryFile() as file:
+            shutil.copyfileobj(source, file, _FEW_BYTES)
+            file.flush()
+            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def release(data: Any) -> None:
+    """Take what was read of a mapped file, or of an array in it, out of the memory."""
+    while isinstance(data, np.ndarray):
+        data = data.base
+    mapped = data.obj if isinstance(data, memoryview) else None
+    if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)

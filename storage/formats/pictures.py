@@ -63,6 +63,13 @@ def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
         raise Damage(f"is no video that can be read ({error.strerror})") from None
 
 
+def video_frames(path: Path) -> Iterator[U8]:
+    """Yield the grey levels of each frame of a video; raises as `opened_video`."""
+    with opened_video(path) as (container, stream):
+        for frame in container.decode(stream):
+            yield levels_of(frame)
+
+
 def levels_of(frame: Any) -> U8:
     """Return the grey levels of a decoded frame, shape (height, width).
 

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
 from slugify import slugify
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, safe_name
-from sliplab.storage.formats.dsec import is_lab_hdf5
+from sliplab.storage.formats.by_time import by_time
 from sliplab.storage.formats.foreign import (
     EXPORT_FORMAT,
     EXPORT_MANIFEST,
@@ -28,22 +28,21 @@ from sliplab.storage.formats.foreign import (
     ForeignTrial,
     FormatError,
     Skipped,
-    before_damage,
     broken,
+    inside,
     read_head,
     refusal,
 )
 from sliplab.storage.formats.format import Files
 from sliplab.storage.formats.known import (
     CORE,
-    DSEC,
-    LAB_HDF5,
     format_names,
     known_format,
     known_formats,
     layouts,
     unusable_formats,
 )
+from sliplab.storage.formats.time_order import in_order
 from sliplab.storage.formats.unread import unread
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import REGISTRATIONS
@@ -319,6 +318,41 @@ def read_file(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
         return replace(before_damage(again, error, salvage), kind=kind)
 
 
+def before_damage(
+    read: Callable[[], ForeignTrial], error: FormatError, salvage: bool
+) -> ForeignTrial:
+    """Return the intact part of a file that could not be read.
+
+    Args:
+        error: the fault that was found.
+
+    Raises:
+        Damage: there is no intact part, or it may not be salvaged, and is only offered.
+        FormatError: the fault is no damage.
+    """
+    try:
+        whole = read()
+        if whole.lost is None:
+            raise error
+        if salvage:
+            return whole
+        events = by_time(whole.events) if whole.any_order else whole.events()
+        chunks = (inside(chunk, whole.event_px()) for chunk in events)
+        parts = [np.empty(0, np.int64), *(chunk.t_us for chunk in chunks)]
+        times = np.concatenate(parts)
+        times = times[in_order(times)]
+    except FormatError as fault:
+        if fault is error:
+            raise
+        worse = fault if isinstance(fault, Damage) else error
+        raise Damage(str(worse), error.file) from None
+    if not len(times):
+        raise Damage(f"{error}; there is no event before that", error.file)
+    packets = "" if whole.packets is None else f", in {whole.packets:,} whole packets"
+    offer = f"--salvage imports {len(times):,} events up to {times[-1]} us{packets}"
+    raise Damage(f"{error}; {offer}", error.file)
+
+
 def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
     try:
         return read_file(kind, file, name, salvage)
@@ -384,9 +418,6 @@ def _possible(file: Path) -> tuple[str, ...]:
 
 def _kind(file: Path) -> str | None:
     kinds = () if unread(file) is not None else _possible(file)
-    if DSEC in kinds:
-        with suppress(FormatError):  # its reader finds the same fault
-            return LAB_HDF5 if is_lab_hdf5(file) else DSEC
     return kinds[0] if kinds else None
 
 

@@ -11,7 +11,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import Any
@@ -23,7 +23,7 @@ from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.data_folder import MOST_BYTES, DataFolder
 from sliplab.storage.formats.foreign import LATEST_US, NO_TIME_NS, FormatError
-from sliplab.storage.formats.numpy_files import ZIP_MAGIC, array_of, arrays_of
+from sliplab.storage.formats.numpy_files import ZIP_MAGIC, array_of, arrays_of, release
 from sliplab.storage.streams import I64
 
 MOST_TABLE = 1 << 26
@@ -31,6 +31,8 @@ _MOST_CELLS = 1 << 14
 """Cells of a row."""
 _SEPARATORS = "\t;, "
 _QUOTED = re.compile('"[^"]*"')
+_BLOCK_BYTES, _ROWS = 1 << 22, 1 << 18
+"""Bytes of CSV and rows of numpy's arrays that are read at once."""
 _TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
 
 
@@ -176,28 +178,36 @@ def _from_csv(place: str, text: str) -> list[TableRow]:
 def read_columns(
     folder: DataFolder, name: str, form: str, columns: Mapping[str, str | int]
 ) -> tuple[dict[str, Any], int]:
-    """Read columns of numbers from a long table.
+    """Read all rows of `column_chunks` at once; return them and the number of rows left out."""
+    chunks, left_out = zip(*column_chunks(folder, name, form, columns), strict=True)
+    return {key: np.concatenate([c[key] for c in chunks]) for key in columns}, sum(left_out)
+
+
+def column_chunks(
+    folder: DataFolder, name: str, form: str, columns: Mapping[str, str | int]
+) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield columns of numbers from a long table, a part of the rows at a time.
 
     Args:
         form: ``csv`` or ``numpy``: a structured array, a two-dimensional one, or an ``.npz`` with
             an array a column.
         columns: name or index of each column.
 
-    Returns:
+    Yields:
         One-dimensional arrays of one length, by the keys of `columns`, and the number of rows of
         CSV that were left out because they are no rows of numbers.
 
     Raises:
-        FormatError: it is damaged, lacks a column, or most rows are not of numbers.
+        FormatError: it is damaged, lacks a column, or most of the first rows are not of numbers.
     """
     data = folder.read(name)
     if form == "csv":
-        return _csv_columns(data, columns)
-    is_npz = bytes(data[: len(ZIP_MAGIC)]) == ZIP_MAGIC
-    found: Any = arrays_of(data, MOST_BYTES) if is_npz else array_of(data)
-    if isinstance(found, dict):
-        there = found
-    elif found.dtype.names is not None:
+        yield from _csv_chunks(data, columns)
+        return
+    if bytes(data[: len(ZIP_MAGIC)]) == ZIP_MAGIC:
+        with folder.local(name) as (path,):
+            there = arrays_of(path, MOST_BYTES)
+    elif (found := array_of(data)).dtype.names is not None:
         there = {column: found[column] for column in found.dtype.names}
     elif found.ndim == 2:
         there = {str(index): found[:, index] for index in range(found.shape[1])}
@@ -208,7 +218,10 @@ def read_columns(
     arrays = {key: _column(there, column) for key, column in columns.items()}
     if len({len(array) for array in arrays.values()}) > 1:
         raise FormatError("has columns of different lengths")
-    return arrays, 0
+    for low in range(0, max(1, len(next(iter(arrays.values())))), _ROWS):
+        yield {key: np.array(array[low : low + _ROWS]) for key, array in arrays.items()}, 0
+        for array in arrays.values():
+            release(array)
 
 
 def _column(there: Mapping[str, Any], column: str | int) -> Any:
@@ -220,10 +233,11 @@ def _column(there: Mapping[str, Any], column: str | int) -> Any:
     return array
 
 
-def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str, Any], int]:
+def _csv_chunks(
+    data: Any, columns: Mapping[str, str | int]
+) -> Iterator[tuple[dict[str, Any], int]]:
     lines = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace").split("\n")
     separator = _separator(lines[0])
-    spaces = separator == " "  # any number of them
     # the first row of numbers may have more cells than the heading
     cells, second = (
         _cells([line for line in rows if line.strip()], separator)
@@ -243,54 +257,118 @@ def _csv_columns(data: Any, columns: Mapping[str, str | int]) -> tuple[dict[str,
         if isinstance(column, str) and cells.count(column) > 1:
             raise FormatError(f"has the column {column} twice")
     wanted = {key: int(there[str(column)]) for key, column in columns.items()}
-    below = f"{'heading' if headed else 'first row'} of {len(cells)} columns"
     width = max(len(cells), len(second)) if headed else len(cells)
+    table = _Csv(separator, cells, columns, wanted, headed, width)
+    for number, block in enumerate(_blocks(data)):
+        if number and not block.strip():
+            continue
+        yield table.read(block)
+        release(data)
 
-    def read(**types: Any) -> pd.DataFrame:
-        # all columns: with some of them alone pandas drops the cells that a row has too many
-        return pd.read_csv(
-            io.BytesIO(data),
-            sep=r"\s+" if spaces else separator,
-            header=None,
-            names=range(width),
-            index_col=False,
-            skiprows=int(headed),
-            low_memory=False,
-            encoding="utf-8-sig",
-            **types,
+
+def _blocks(data: Any) -> Iterator[bytes]:
+    """Yield a text in blocks that end with a row; at least one."""
+    low, size = 0, _BLOCK_BYTES
+    while low < len(data) or not low:
+        block, at_end = bytes(data[low : low + size]), low + size >= len(data)
+        end = len(block) if at_end else block.rfind(b"\n") + 1
+        if not at_end and (not end or block.count(b'"', 0, end) % 2):
+            size *= 2  # a row or a quoted cell continues
+            continue
+        yield block[:end]
+        low, size = low + max(end, 1), _BLOCK_BYTES
+
+
+@dataclass
+class _Csv:
+    """A long table of CSV that is read in blocks of rows.
+
+    Attributes:
+        cells: of the heading, or else of the first row.
+        wanted: index of each column that is read, by its key.
+        width: cells of the widest row so far.
+        lines: of the blocks before. rows: of numbers in them.
+    """
+
+    separator: str
+    cells: list[str]
+    columns: Mapping[str, str | int]
+    wanted: Mapping[str, int]
+    headed: bool
+    width: int
+    lines: int = 0
+    rows: int = 0
+
+    def read(self, block: bytes) -> tuple[dict[str, Any], int]:
+        """Return the columns of a block, and the number of rows that were left out.
+
+        Raises:
+            FormatError: it is no CSV, or the first block and most of its rows are not of numbers.
+        """
+        is_first = not self.lines
+        line, table = self._table(block, int(is_first and self.headed))
+        first_row = 1 + self.headed + self.rows
+        self.lines += block.count(b"\n")
+        self.rows += len(table)
+        if table.empty:
+            return {key: np.empty(0, np.int64) for key in self.wanted}, 0
+        # separators at the ends of rows make empty cells
+        beyond = table.iloc[:, len(self.cells) :].notna().to_numpy()
+        good = ~beyond.any(axis=1)
+        if is_first and 2 * int(good.sum()) <= len(good):
+            at = int((~good).argmax())
+            last = int(np.flatnonzero(beyond[at])[-1])
+            raise self._too_wide(len(self.cells) + last + 1, line or first_row + at)
+        for index in self.wanted.values():
+            good &= pd.to_numeric(table[index], errors="coerce").notna().to_numpy()
+        if good.all() or (is_first and 2 * int(good.sum()) <= len(good)):
+            found = {key: table[index].to_numpy() for key, index in self.wanted.items()}
+        elif not good.any():
+            return {key: np.empty(0, np.int64) for key in self.wanted}, len(table)
+        else:  # as text: an empty cell makes floats of whole numbers
+            _, words = self._table(
+                block, int(is_first and self.headed), dict.fromkeys(self.wanted.values(), str)
+            )
+            words = words[good]
+            found = {
+                key: pd.to_numeric(words[index]).to_numpy() for key, index in self.wanted.items()
+            }
+        rows = {key: _numbers(v, self.columns[key], first_row) for key, v in found.items()}
+        return rows, len(table) - len(next(iter(rows.values())))
+
+    def _table(self, block: bytes, skipped: int, types: Any = None) -> tuple[int, pd.DataFrame]:
+        """Return the first row that is wider than those before, 0 for none, and all rows."""
+        line = 0
+        while True:
+            try:
+                # of some columns alone pandas drops the cells that a row has too many
+                return line, pd.read_csv(
+                    io.BytesIO(block),
+                    sep=r"\s+" if self.separator == " " else self.separator,  # any number of spaces
+                    header=None,
+                    names=range(self.width),
+                    index_col=False,
+                    skiprows=skipped,
+                    low_memory=False,
+                    encoding="utf-8-sig",
+                    dtype=types,
+                )
+            except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
+                text = " ".join(str(error).split())
+                wide = _TOO_WIDE.search(text)
+                if wide is None:
+                    raise FormatError(f"is not CSV: {text}") from None
+                row = self.lines + int(wide[1])
+                if not self.width < int(wide[2]) <= _MOST_CELLS:
+                    raise self._too_wide(int(wide[2]), row) from None
+                self.width, line = int(wide[2]), line or row
+
+    def _too_wide(self, cells: int, row: int) -> FormatError:
+        what = "heading" if self.headed else "first row"
+        return FormatError(
+            f"has {cells} cells in row {row} below a {what} of {len(self.cells)} columns; name "
+            "every column, and quote a cell that contains the separator"
         )
-
-    line = 0
-    while True:
-        try:
-            table = read()
-            break
-        except (ValueError, OverflowError) as error:  # also pandas' own errors of parsing
-            text = " ".join(str(error).split())
-            wide = _TOO_WIDE.search(text)
-            if wide is None:
-                raise FormatError(f"is not CSV: {text}") from None
-            if not width < int(wide[2]) <= _MOST_CELLS:
-                raise _too_wide(int(wide[2]), int(wide[1]), below) from None
-            width, line = int(wide[2]), line or int(wide[1])
-    if table.empty:
-        return {key: np.empty(0, np.int64) for key in wanted}, 0
-    # separators at the ends of rows make empty cells
-    beyond = table.iloc[:, len(cells) :].notna().to_numpy()
-    good = ~beyond.any(axis=1)
-    if 2 * int(good.sum()) <= len(good):
-        at = int((~good).argmax())
-        last = int(np.flatnonzero(beyond[at])[-1])
-        raise _too_wide(len(cells) + last + 1, line or 1 + headed + at, below)
-    for index in wanted.values():
-        good &= pd.to_numeric(table[index], errors="coerce").notna().to_numpy()
-    if good.all() or 2 * int(good.sum()) <= len(good):
-        found = {key: table[index].to_numpy() for key, index in wanted.items()}
-    else:  # as text: an empty cell makes floats of whole numbers
-        words = read(dtype=dict.fromkeys(wanted.values(), str))[good]
-        found = {key: pd.to_numeric(words[index]).to_numpy() for key, index in wanted.items()}
-    rows = {key: _numbers(values, columns[key], 1 + headed) for key, values in found.items()}
-    return rows, len(table) - len(next(iter(rows.values())))
 
 
 def _cells(lines: list[str], separator: str) -> list[str]:
@@ -305,13 +383,6 @@ def _cells(lines: list[str], separator: str) -> list[str]:
         return [cell.strip() for cell in next(rows, [])]
     except csv.Error as error:
         raise FormatError(f"is not CSV: {error}") from None
-
-
-def _too_wide(cells: int, row: int, below: str) -> FormatError:
-    return FormatError(
-        f"has {cells} cells in row {row} below a {below}; name every column, and quote a cell that "
-        "contains the separator"
-    )
 
 
 def _numbers(column: Any, name: str | int, first_row: int) -> Any:

@@ -26,9 +26,6 @@ from sliplab.storage.streams import I64
 Mask = npt.NDArray[np.bool_]
 MOST_ROWS = 1 << 27
 """Rows that are searched, with 16 bytes of memory each; of more the longest run is taken."""
-_NEAR_US, _FEW_FALLS, _MIXED_SHARE = 100_000, 10, 0.9
-"""Step back up to which packets overlap; steps back, and share of the rows in order, up to which
-they are faults."""
 _RESTART_SHARE = 0.01
 """Share of the rows from which on those that are left out in a row may be a restart."""
 _REPEATED, _MOST_FALLS = 8, 1000
@@ -38,25 +35,6 @@ _REPEATED, _MOST_FALLS = 8, 1000
 def falls(times: I64) -> bool:
     """Return whether a time is earlier than the one before it."""
     return bool(np.any(times[1:] < times[:-1]))
-
-
-def is_unordered(t_us: I64, positive: Mask) -> bool:
-    """Return whether a file lists events in another order than that of their times.
-
-    That is so where those of each polarity are in order, where times step back by no more than
-    0.1 s, or in many places, such as in lists by pixel. A few larger steps back are faults.
-
-    Args:
-        t_us: times. positive: which events are ON; both of shape (n,).
-    """
-    if not falls(t_us):
-        return False
-    if not (falls(t_us[positive]) or falls(t_us[~positive])):
-        return True
-    if int((np.maximum.accumulate(t_us) - t_us).max()) <= _NEAR_US:
-        return True
-    few = int((t_us[1:] < t_us[:-1]).sum()) <= _FEW_FALLS
-    return not few and float(in_order(t_us).mean()) < _MIXED_SHARE
 
 
 def in_order(times: I64) -> Mask:

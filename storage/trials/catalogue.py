@@ -32,6 +32,7 @@ from sliplab.protocols.plan import condition_columns
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.checksums import incomplete
+from sliplab.storage.trials.hdf5_writer import STREAMS
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 
@@ -323,7 +324,7 @@ def _row(campaign: str, recording: Recording) -> Row:
         **{
             f"{name}_{stream.kind}": stream.rows
             for name, stream in record.streams.items()
-            if stream.of_camera
+            if stream.kind not in STREAMS  # which have figures
         },
     }
 

@@ -52,6 +52,8 @@ from sliplab.storage.trials.hdf5_writer import (
 from sliplab.storage.trials.packed_chunks import Filter, unpacked_bytes
 from sliplab.storage.trials.superblock import HEAD_BYTES, closed
 
+EVENTS_AT_ONCE = 1 << 18
+"""Events of a chunk of `StreamReader.event_chunks`."""
 MOST_STREAMS = 64
 """Named streams that are read of one trial; a file with more was not written by SlipLab."""
 _BLOCK = 1 << 15
@@ -644,6 +646,17 @@ class StreamReader:
         self._check_pixels(found)
         return found
 
+    def event_chunks(self) -> Iterator[EventChunk]:
+        """Yield all events, `EVENTS_AT_ONCE` of them at a time."""
+        x, y, p, t = self._group("events", "x", "y", "p", "t")
+        for low in range(0, len(t), EVENTS_AT_ONCE):
+            high = min(low + EVENTS_AT_ONCE, len(t))
+            found = EventChunk(
+                x.read(low, high), y.read(low, high), p.read(low, high), self._times(low, high)
+            )
+            self._check_pixels(found)
+            yield found
+
     def _check_pixels(self, found: EventChunk) -> None:
         """Refuse events outside of the camera: what counts them by pixel relies on it.
 
@@ -753,6 +766,16 @@ class StreamReader:
             NotOurs: there is no such stream, or one of them is no column.
         """
         return self._file.parts(name)
+
+    def stream(self, name: str) -> dict[str, Array]:
+        """Return all rows of a named stream of any kind, by column.
+
+        Raises:
+            NotOurs: there is no such stream, or it is none that SlipLab wrote.
+        """
+        parts = self.parts(name)
+        rows = self._group(f"{STREAM_GROUP}/{name}", *parts)
+        return {part: column.read() for part, column in zip(parts, rows, strict=True)}
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""

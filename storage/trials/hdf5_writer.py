@@ -52,6 +52,8 @@ Array = npt.NDArray[Any]
 
 FORMAT, INDEX_CUT_FORMAT = 2, 3
 """Formats of new files; the second one where the index ends before the events do."""
+CACHE_BYTES = 1 << 20
+"""Cache of each column. Chunks are written whole: HDF5's own 8 MiB would only hold memory."""
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
@@ -222,7 +224,7 @@ class StreamFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         path.write_bytes(blank())
-        self._file = h5py.File(path, "r+", libver="latest")
+        self._file = h5py.File(path, "r+", libver="latest", rdcc_nbytes=CACHE_BYTES)
         self._offset: int | None = None
         self._last_us: int | None = None
         self._next_ms = 0

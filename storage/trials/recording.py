@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.protocols.program import ACTING
 from sliplab.storage.clockmap import ClockMap
@@ -20,7 +21,9 @@ from sliplab.storage.streams import (
     F64,
     FRAMES_KIND,
     I64,
+    SCALAR,
     U8,
+    WRENCH,
     EventChunk,
     ScalarChunk,
     WrenchChunk,
@@ -272,15 +275,19 @@ class Recording:
         """Names of the streams of some kinds, the first cameras' ``events`` and ``frames`` first.
 
         Args:
-            kinds: of ``events``, ``frames``, ``scalar`` and ``wrench``.
+            kinds: ``events``, ``frames``, ``scalar``, ``wrench``, and those of other packages; all
+                if left out.
         """
         record = self.record
         with_events, with_frames = record.clocks.events is not None, self.frame_source != "none"
         first = {EVENTS_KIND: with_events, FRAMES_KIND: with_frames}
-        named = [name for name, stream in record.streams.items() if stream.kind in kinds]
-        return [name for name, there in first.items() if there and name in kinds] + sorted(named)
+        named = {name: stream.kind for name, stream in sorted(record.streams.items())}
+        found = {name: name for name, there in first.items() if there} | named
+        return [name for name, kind in found.items() if not kinds or kind in kinds]
 
     def _check_stream(self, name: str, *kinds: str) -> None:
+        if name in {EVENTS_KIND, FRAMES_KIND} & set(kinds):
+            return
         stream = self.record.streams.get(name)
         if stream is None or stream.kind not in kinds:
             raise StoreError(
@@ -315,8 +322,7 @@ class Recording:
         Raises:
             StoreError: the trial has no such stream.
         """
-        if stream != EVENTS_KIND:
-            self._check_stream(stream, EVENTS_KIND)
+        self._check_stream(stream, EVENTS_KIND)
         clock = self.clock(stream)
         bounds = [
             None if t is None else -(-int(clock.to_device(t)) // 1000) for t in (start_ns, end_ns)
@@ -330,9 +336,29 @@ class Recording:
         Raises:
             StoreError: the trial has no such stream; the message lists those that it has.
         """
-        self._check_stream(name, ScalarChunk.KIND.name)
+        self._check_stream(name, SCALAR.name)
         with self.open() as reader:
             return reader.scalars(name)
+
+    def samples(self, name: str) -> dict[str, npt.NDArray[Any]]:
+        """Samples of a named stream of any kind but a camera's, each of shape (n, ...).
+
+        Returns:
+            its columns by their stored names, ``t`` as ns on the time line, without ``host``.
+
+        Raises:
+            StoreError: the trial has no such stream.
+        """
+        about = self.record.streams
+        known = [key for key, stream in about.items() if not stream.of_camera]
+        if name not in known:
+            there = ", ".join(sorted(known)) or "none"
+            raise StoreError(f"{self.folder}: the trial has no samples '{name}'; it has: {there}")
+        with self.open() as reader:
+            found = reader.stream(name) if about[name].rows else {}
+        found.pop("host", None)
+        times = found.pop("t", np.empty(0, np.int64))
+        return {"t": np.asarray(self.clock(name).to_reference(times)), **found}
 
     def wrenches(self, name: str = "force") -> WrenchChunk:
         """Forces and torques of a named stream, on the sensor's own clock and in its own axes.
@@ -340,13 +366,7 @@ class Recording:
         Raises:
             StoreError: the trial has no such stream; the message lists those that it has.
         """
-        streams = self.record.streams
-        known = [key for key, stream in streams.items() if stream.kind == WrenchChunk.KIND.name]
-        if name not in known:
-            raise StoreError(
-                f"{self.folder}: the trial has no wrenches '{name}'; it has: "
-                f"{', '.join(sorted(known)) or 'none'}"
-            )
+        self._check_stream(name, WRENCH.name)
         with self.open() as reader:
             return reader.wrenches(name)
 

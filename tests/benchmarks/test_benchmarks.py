@@ -23,6 +23,7 @@ TINY: dict[str, dict[str, Any]] = {
     "orchestration": {"trials": 30, "runs": 1, "records": 50, "starts": 0, "long": 40},
     "acquisition": {"seconds": 0.5, "events_per_s": 100_000, "size": 96, "pictures": 4}
     | {"saturating": 20},
+    "exchange_memory": {"events": 20_000, "forms": ("dsec",)},
     "fewer": {"worlds": 1, "adaptive": 1, "cores": 1},
     "statements": {"campaigns": 1, "cores": 1},
 }
@@ -43,6 +44,7 @@ PROMISED = {
     | {"dropped_on_purpose", "dropped_noticed"},
     "labels": {"x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime"}
     | {"aruco_x_realtime"},
+    "exchange_memory": {"dsec_import_peak_mb", "dsec_export_peak_mb"},
     "fewer": {f"{way}_worst_claim_wrong_percent" for way in ("shuffled", "adaptive")}
     | {f"{way}_true_trials_percent" for way in ("shuffled", "adaptive")}
     | {"adaptive_over_shuffled"},
@@ -53,10 +55,10 @@ PROMISED = {
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
 }
-MARKS = dict.fromkeys(("scene", "fewer", "statements"), pytest.mark.long)
+MARKS = dict.fromkeys(("scene", "fewer", "statements", "orchestration"), pytest.mark.long)
 MARKS["acquisition"] = pytest.mark.realtime
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
-campaigns."""
+campaigns, and `orchestration` servers."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in TINY])

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from benchmarks.emulator import FRAME_NS, SOURCE, draw, emulate, find_emulator
 from sliplab.rigs.scene.events import EventOptics, MarkerSensor
 
-OPTICS = replace(EventOptics(), width=160, height=120, noise_hz=0.0, hot_pixels=0, readout_hz=0.0)
+OPTICS = EventOptics(width=160, height=120, noise_hz=0.0, hot_pixels=0, readout_hz=0.0)
 LAYOUT = np.array([[-2.5, 0.0], [2.0, 1.0]])
 PACKAGE = '''
 import numpy as np
@@ -65,7 +64,7 @@ def circling(px_per_s: float, milliseconds: int) -> tuple[np.ndarray, np.ndarray
 @pytest.mark.usefixtures("checkout")
 def test_v2e_gets_our_frames_and_thresholds() -> None:
     """The emulator returns our events, each at the end of its frame."""
-    optics = replace(OPTICS, refractory_us=0.0)
+    optics = OPTICS.model_copy(update={"refractory_us": 0.0})
     loads, t_ns = circling(40.0, 400)
     sensor = MarkerSensor(optics, LAYOUT, 3)
     sensor.reset(loads[0], 1)

@@ -48,7 +48,7 @@ def protocol(trials: int, video: bool = False) -> dict[str, Any]:
     ]
     collection["motion"][3]["distance"] = "1.6 mm"
     collection["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
-    collection["maintenance"] = {"rezero": {"every": 7, "speed": "0.5 mm/s", "search": "1.5 mm"}}
+    collection["maintenance"] = {"rezero": {"every": 7, "speed": "0.5 mm/s", "search": "0.5 mm"}}
     # about one attempt in five is over this, so that retakes are interrupted as well
     collection["gates"]["sync_uncertainty"]["digital_input"] = "0.0036 ms"
     collection["gates"]["retakes"] = 10

@@ -7,9 +7,12 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.command_line import MANY
 from tests.conftest import ROOT
@@ -58,6 +61,22 @@ class Lab:
         )
         assert done.returncode == 0, f"{words}\n{done.stdout}{done.stderr}"
         return done.stdout
+
+
+def install(package: str, site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install a package by what an installer writes, for one test."""
+    project = tomllib.loads((EXAMPLES / package / "pyproject.toml").read_text())["project"]
+    info = site / f"{package.replace('-', '_')}-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.1.0\n")
+    lines = [
+        line
+        for group, points in project["entry-points"].items()
+        for line in (f"[{group}]", *(f"{name} = {place}" for name, place in points.items()))
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    for folder in (site, EXAMPLES / package):
+        monkeypatch.syspath_prepend(str(folder))
 
 
 def checkout() -> str:

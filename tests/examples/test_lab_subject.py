@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import shutil
-import tomllib
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.classes import class_evaluation_of
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.problem import Workers, problem_of
 from sliplab.analysis.report.page import Rendered
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
+from sliplab.analysis.trial_work import in_order
 from sliplab.flows.cli import app as cli
+from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome, searches
 from sliplab.plugins.bench.registry import known, make_detector
@@ -21,7 +28,8 @@ from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
-from tests.examples.conftest import EXAMPLES
+from tests.examples.conftest import install
+from tests.flows.class_store import adapter, class_store
 
 Ran = tuple[list[RunRequest], StudyOutcome]
 
@@ -29,18 +37,7 @@ Ran = tuple[list[RunRequest], StudyOutcome]
 @pytest.fixture
 def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Install the package by what an installer writes, for one test."""
-    project = tomllib.loads((EXAMPLES / "lab-subject" / "pyproject.toml").read_text())["project"]
-    info = tmp_path / "site" / "lab_subject-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lab-subject\nVersion: 0.1.0\n")
-    lines = [
-        line
-        for group, points in project["entry-points"].items()
-        for line in (f"[{group}]", *(f"{name} = {place}" for name, place in points.items()))
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines))
-    for folder in (info.parent, EXAMPLES / "lab-subject"):
-        monkeypatch.syspath_prepend(str(folder))
+    install("lab-subject", tmp_path / "site", monkeypatch)
     groups, added = list(cli.app.registered_groups), set(cli._added)
     plugins.cache_clear()
     yield
@@ -73,6 +70,30 @@ def test_command_study_and_section(ran: Ran, tmp_path: Path) -> None:
     assert isinstance(last, Rendered)
     assert (last.title, "(simulated)" in last.html) == ("Event rates", True)
     assert found["rates"][0]["trial"] in last.html
+
+
+@pytest.mark.usefixtures("subject")
+def test_problem_is_trained_evaluated_and_reported(tmp_path: Path) -> None:
+    parts = {"train": 2, "validation": 1, "test": 2}
+    store = class_store(tmp_path / "store", trials=parts, head=adapter(name="boxes"))
+    campaigns = collected(store)
+    label(store, campaigns)
+    problem = problem_of(StoreLabels(store), campaigns)
+    train, validation = map(problem.samples, ("train", "validation"))
+    display = nullcontext(SimpleNamespace(epoch=lambda record: None))
+    for model in problem.models():
+        problem.train(model, train, validation, lambda model: display)
+    job = problem.job(None, None)
+    workers = Workers(lambda split: in_order, lambda step, work, make: None, None)
+    problem.evaluate(job, problem.prepare(job, workers))
+    page = problem.page(lambda item: 0, {})
+    scores = class_evaluation_of(store).scores
+    assert scores.classes == ("box", "other")
+    # two of the five objects are boxes
+    assert [sum(row) for row in scores.confusion] == [4, 6]
+    assert model_file.load(store.folder / "models" / "classes-seed0.pt").classes == scores.classes
+    assert page.numbers["classes"]["classes"] == ["box", "other"]
+    assert "other" in page.html
 
 
 @pytest.mark.usefixtures("subject")

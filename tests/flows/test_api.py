@@ -146,7 +146,7 @@ def test_what_is_not_there_is_named(store: sliplab.Store, tmp_path: Path) -> Non
         sliplab.open_store(tmp_path)
     with pytest.raises(sliplab.InputError, match="no built-in protocol"):
         sliplab.plan("nothing")
-    with pytest.raises(sliplab.InputError, match="must be 1 or more"):
+    with pytest.raises(sliplab.InputError, match="trials = 0: must be greater"):
         sliplab.collect("pilot", "rehearsal", tmp_path / "new", trials=0)
     assert not (tmp_path / "new").exists()
 

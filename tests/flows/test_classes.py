@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -261,7 +262,6 @@ REFUSED = {
     "evaluate STORE --smoothing 3": (2, "--smoothing = 3: sets how slip is detected"),
     "evaluate STORE --checks": (1, ABOUT_SLIP),
     "evaluate STORE --model STORE/models/classes-seed0.pt": (1, ABOUT_SLIP),
-    "report STORE --against STORE": (2, "is a report on recordings of classes"),
     "generalise STORE": (1, ABOUT_SLIP),
     "holdout STORE": (1, ABOUT_SLIP),
     "tradeoff STORE": (1, ABOUT_SLIP),
@@ -278,6 +278,13 @@ def test_what_belongs_to_slip_says_so_in_one_line(judged: Store, command: str) -
     assert len([line for line in done.stderr.splitlines() if line.startswith("error: ")]) == 1
     assert text in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
+
+
+def test_two_reports_on_classes_are_compared(judged: Store) -> None:
+    found = here("report", judged.folder, "--against", judged.folder, "--json")
+    figures = {row["name"]: row for row in json.loads(found.stdout)["against"]["figures"]}
+    assert {"accuracy, strict", "accuracy on recordings, argmax"} <= figures.keys()
+    assert not any(row["difference"] for row in figures.values())
 
 
 def test_classes_and_slip_are_analysed_apart(copied: Store) -> None:

@@ -23,7 +23,6 @@ from sliplab.flows.running.console import plain
 from sliplab.flows.study import StudyOutcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
-from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store, StoreError
 from tests.analysis.report.test_plugin_sections import install
 from tests.conftest import ROOT
@@ -247,11 +246,10 @@ def test_the_report_is_made_again_only_when_something_changed(
     assert before == after
 
 
-def test_a_report_on_frames_is_not_compared(taken: Take) -> None:
-    from sliplab.analysis.report.against import load_other
-
+def test_a_report_on_frames_is_compared(taken: Take) -> None:
     store = taken("frames")
-    with pytest.raises(InputError, match="one camera"):
-        load_other(store.folder)
-    with pytest.raises(InputError, match="one camera"):
-        against(store, store.folder)
+    figures = against(store, store.folder)[0].figures
+    assert {"trials committed", "labels: gross, median distance from the truth"} <= {
+        each.name for each in figures
+    }
+    assert {each.beyond for each in figures} <= {False, None}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sliplab
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.report import campaign, outcomes
@@ -397,6 +398,13 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     trend = f"changes by {slope:+.2f} % in 100 trials"
     assert trend in " ".join(said[1].split())
     assert "more than chance." in said[1]
+
+
+def test_scores_have_every_trial_with_its_condition(store: Store) -> None:
+    scores = sliplab.open_store(store.folder).scores()
+    outcomes = scores[scores.figure == "outcome.detected_first"]
+    assert outcomes.trial.tolist() == [row.trial for row in read_summary(store).trials]
+    assert (outcomes.condition != "").all()
 
 
 def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:

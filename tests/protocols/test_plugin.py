@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,12 @@ for words in json.loads(sys.argv[1]):
 """
 
 
+def loaded(*commands: Sequence[str]) -> list[list[str]]:
+    """Run commands in a new process; return the modules of plug-ins that are there after each."""
+    said = said_by(LOADED, json.dumps(commands)).splitlines()
+    return [json.loads(line) for line in said if line.startswith("[")]
+
+
 def test_a_command_loads_no_plug_in_that_it_does_not_use(tmp_path: Path) -> None:
     """One after another in a new process: what one loads stays for the next."""
     claims = tmp_path / "claims.yaml"
@@ -34,15 +40,13 @@ def test_a_command_loads_no_plug_in_that_it_does_not_use(tmp_path: Path) -> None
     pilot = (ROOT / "protocols" / "pilot.yaml").read_text()
     claims.write_text(pilot.replace("collection:\n", f"collection:\n{stopping}", 1))
     options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
-    commands = [
+    *core, collected, helped = loaded(
         ("plan", "pilot", "--json"),
         ("collect", "pilot", *options),
         ("plan", str(claims), "--json"),
         ("collect", str(claims), *options[:3], str(tmp_path / "other"), *options[4:]),
         ("bench", "--help"),
-    ]
-    said = said_by(LOADED, json.dumps(commands)).splitlines()
-    *core, collected, helped = (json.loads(line) for line in said if line.startswith("["))
+    )
     assert core == [[], [], []]
     assert "sliplab.plugins.claims.rounds" in collected
     assert not [name for name in collected if name.startswith("sliplab.plugins.claims.power")]

@@ -69,8 +69,7 @@ class LabCamera:
 
     def read_pulses(self) -> PulseChunk:
         """Return the sync pulses since the last call, camera clock in ns. Raises as `read`."""
-        pulses = self._buffer.take("pulses")
-        return PulseChunk(np.concatenate(pulses) if pulses else np.empty(0, np.int64))
+        return PulseChunk.concatenate(self._buffer.take("pulses"))
 
     def stop(self) -> None:
         """Stop streaming; what has come can still be read. Takes at most `ANSWER_S`."""
@@ -144,7 +143,7 @@ class LabCamera:
             self._buffer.add("events", chunk, t_us, len(data))
         elif kind == wire.EDGES:
             edges_us = np.frombuffer(data, wire.EDGE).astype(np.int64)
-            self._buffer.add("pulses", edges_us * 1000, edges_us, len(data))
+            self._buffer.add("pulses", PulseChunk(edges_us * 1000), edges_us, len(data))
         else:
             if kind == wire.STARTED:
                 self._buffer.begin()

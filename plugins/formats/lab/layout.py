@@ -20,10 +20,9 @@ from sliplab.plugins.formats.lab.run import (
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError, broken, refusal
 from sliplab.storage.formats.format import Files, Format, Layout
-from sliplab.storage.formats.known import DSEC, LAB_HDF5
 from sliplab.storage.formats.recognition import read_file
 
-LAB_PICKLES = "lab-pickles"
+LAB_PICKLES, LAB_HDF5, DSEC = "lab-pickles", "lab-hdf5", "dsec"
 
 
 def _events_folder(path: Path) -> Path | None:

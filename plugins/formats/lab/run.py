@@ -31,7 +31,7 @@ from sliplab.storage.formats.foreign import (
     rounded_us,
 )
 from sliplab.storage.formats.numpy_files import MAGIC, array_of
-from sliplab.storage.formats.pictures import levels_of, opened_video
+from sliplab.storage.formats.pictures import video_frames
 from sliplab.storage.streams import FRAMES_KIND, EventChunk, FrameChunk, Json, WrenchChunk
 
 EVENTS_FOLDER, VIDEOS_FOLDER, META = "events", "videos", "meta.json"
@@ -206,7 +206,7 @@ def _video_streams(run: Path, stem: str, notes: list[str]) -> dict[str, Camera]:
             notes.append(f"{camera}: {what} of {stem}; its frames are not imported")
             continue
         try:
-            first = next(_decoded(video), None)
+            first = next(video_frames(video), None)
         except FormatError as error:
             notes.append(f"{video.name} {error}; its frames are not imported")
             continue
@@ -271,18 +271,12 @@ def _by_recording(path: Path, changed_ns: int) -> Any:
     return read_pickle(path)
 
 
-def _decoded(video: Path) -> Iterator[Any]:
-    with opened_video(video) as (container, stream):
-        for frame in container.decode(stream):
-            yield levels_of(frame)
-
-
 def _frames(video: Path, times: Any, notes: list[str]) -> Iterator[FrameChunk]:
     """Yield the frames of a video with their times, from the first one on."""
     t_ns = _in_ns(times)
     count = 0
     try:
-        for count, image in enumerate(_decoded(video), 1):
+        for count, image in enumerate(video_frames(video), 1):
             if count <= len(t_ns):
                 row = t_ns[count - 1 : count]
                 number = np.array([count - 1], np.int64)

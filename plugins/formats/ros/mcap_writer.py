@@ -19,6 +19,7 @@ import numpy as np
 
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.files import inside, json_text
+from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.schema.label import KINDS, LABELS, RULES, RuleOnsets, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, Json
 from sliplab.storage.trials.checksums import DATA, PROVENANCE, RECORD, stream_file
@@ -48,7 +49,6 @@ ARM, BASE = "arm", "arm_base"
 _PACKET_US = 10_000
 _PACKET_EVENTS = 1 << 16
 _ROWS = 1 << 14
-_READ_EVENTS = 1 << 20
 _PULSES = {"event_pulses": EVENTS_KIND, "arm_pulses": ARM, "sync_pulses": "sync_box"}
 
 Message = tuple[int, int, bytes]
@@ -73,6 +73,11 @@ def write_mcap(
     """
     from mcap.writer import Writer
 
+    for name, stream in recording.record.streams.items():
+        if not stream.of_camera and stream.kind not in STREAMS:
+            raise FormatError(
+                f"has the stream '{name}' of kind '{stream.kind}', which MCAP does not take"
+            )
     with path.open("xb") as handle:
         writer = Writer(handle)
         writer.start(profile="ros2", library=LIBRARY)
@@ -309,15 +314,11 @@ class _Trial:
 
 def _packets(recording: Recording, name: str) -> Iterator[EventChunk]:
     """Yield events in packets of at most 10 ms and 65,536 events."""
+    first = None
     with recording.open(name) as reader:
-        times = reader.event_times()
-        if not len(times):
-            return
-        cuts = np.unique(times[::_READ_EVENTS]).tolist()
-        for start, end in zip(cuts, [*cuts[1:], None], strict=True):
-            chunk = reader.events(start, end)
-            parts = (chunk.t_us - times[0]) // _PACKET_US
-            edges = np.flatnonzero(np.diff(parts)) + 1
+        for chunk in reader.event_chunks():
+            first = int(chunk.t_us[0]) if first is None else first
+            edges = np.flatnonzero(np.diff((chunk.t_us - first) // _PACKET_US)) + 1
             whole = np.union1d(edges, np.arange(0, len(chunk), _PACKET_EVENTS)).tolist()
             for low, high in zip(whole, [*whole[1:], len(chunk)], strict=True):
                 yield chunk[low:high]

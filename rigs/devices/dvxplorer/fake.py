@@ -26,7 +26,8 @@ from sliplab.rigs.devices.dvxplorer.fake_stream import (
     triggers_packet,
 )
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
-from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.rigs.scene.events import MarkerSensor
+from sliplab.rigs.scene.optics import EventOptics
 from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import I64, EventChunk

@@ -29,6 +29,8 @@ RNG = np.random.default_rng(7)
 LATE = RNG.gamma(4.0, 25.0, 180)
 """As latencies are: positive and skewed."""
 SIZES = (3, 6, 12, 132)
+SOME = [pytest.param(n, marks=() if n in {3, 12} else pytest.mark.long) for n in SIZES]
+"""Few, where approximations fail first, and a usual number; the long tests have all."""
 NOISE = 2.6 / np.sqrt(1500) * np.sqrt(0.05 * 0.95)
 """By which a share of 95 % in 1,500 draws is off in one case of a hundred."""
 
@@ -47,7 +49,7 @@ def as_said(found: float) -> bool:
     return 0.93 - NOISE <= found <= 0.97 + NOISE
 
 
-@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize("kind", ["normal", "skewed"])
 def test_a_mean_is_held_as_often_as_said(kind: str, n: int) -> None:
     def measure(rng: np.random.Generator) -> Any:
@@ -56,7 +58,7 @@ def test_a_mean_is_held_as_often_as_said(kind: str, n: int) -> None:
     assert as_said(coverage(measure, 80.0, n))
 
 
-@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize(("a", "b"), [(18, 2), (9, 1)])
 def test_a_share_of_windows_is_held_as_often_as_said(a: int, b: int, n: int) -> None:
     """Trials of 100 to 200 windows, each with a share of its own."""
@@ -77,7 +79,7 @@ def test_a_quantile_is_held_as_often_as_said(statistic: str, n: int) -> None:
     assert as_said(found)
 
 
-@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize("paired", [False, True])
 def test_a_difference_of_means_is_held_as_often_as_said(paired: bool, n: int) -> None:
     """Every sixth trial or so has no value in one of the two sets."""
@@ -93,7 +95,7 @@ def test_a_difference_of_means_is_held_as_often_as_said(paired: bool, n: int) ->
     assert as_said(coverage(measure, 10.0, n))
 
 
-@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("n", SOME)
 def test_a_difference_of_shares_is_held_as_often_as_said(n: int) -> None:
     def measure(rng: np.random.Generator) -> Any:
         windows = rng.integers(100, 200, n)

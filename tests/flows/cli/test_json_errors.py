@@ -27,7 +27,7 @@ GONE = "ROOM/nowhere"
 ALONE = (
     *("plan", "sync", "label", "train", "evaluate", "report", "generalise", "trials"),
     *("holdout", "verify", "migrate", "pause", "resume", "stop", "review", "reflex", "stress"),
-    "tradeoff",
+    *("tradeoff", "status", "log"),
 )
 WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
     # command: arguments, and the file, key and value that its error names
@@ -43,6 +43,7 @@ WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
             "import": f"{GONE} --store ROOM/i --name n",
             "export": f"{GONE} x --output ROOM/o",
             "publish": f"{GONE} --as croissant --output ROOM/o",
+            "alerts": f"{GONE} ROOM/file",
             "view": f"{GONE} x",
             "detect": f"--rig mock --model {GONE}",
             "export-model": f"{GONE} --out ROOM/e",

@@ -196,7 +196,7 @@ def test_a_rig_without_a_sensor_says_nothing_of_forces(unfelt: Campaign) -> None
     assert "streams" not in data["clocks"]
     assert "force" not in text
     assert not has_forces(recording)
-    with pytest.raises(StoreError, match="no wrenches 'force'"):
+    with pytest.raises(StoreError, match="no wrench 'force'"):
         plate_forces(recording)
     store = Store.open(unfelt.folder.parents[1])
     assert force_section(store, [Collected(unfelt)], None, simulated=True) is None

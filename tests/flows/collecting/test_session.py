@@ -27,6 +27,7 @@ def short() -> dict[str, Any]:
     data["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
     data["collection"]["motion"][3]["distance"] = "1.6 mm"
     data["collection"]["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
+    data["collection"]["maintenance"]["rezero"]["search"] = "0.5 mm"
     data["analysis"]["split"] = {"method": "ranked"}
     return data
 

@@ -321,7 +321,7 @@ def worlds(k: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], F6
     return [dict(zip(keys, row, strict=True)) for row in rows.tolist()], s
 
 
-@pytest.mark.parametrize("k", [40, 200])
+@pytest.mark.parametrize("k", [40, pytest.param(200, marks=pytest.mark.long)])
 def test_false_alarms_keep_to_the_level(k: int) -> None:
     rng = np.random.default_rng(k)
     alarms = total = 0

@@ -114,7 +114,14 @@ def test_a_linear_gaussian_posterior_is_the_closed_form() -> None:
 
 @pytest.mark.parametrize(
     ("toy", "p", "k"),
-    [(linear, 3, 200), (ridge, 2, 300), (uneven, 2, 300), (curved, 3, 400), (crowded, 5, 250)],
+    [
+        (linear, 3, 200),
+        (ridge, 2, 300),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in ((uneven, 2, 300), (curved, 3, 400), (crowded, 5, 250))
+        ),
+    ],
 )
 def test_intervals_hold_nineteen_of_twenty_worlds(toy: Toy, p: int, k: int) -> None:
     held, identified, edge, truths, samples = [], [], [], [], []

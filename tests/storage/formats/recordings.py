@@ -32,11 +32,6 @@ def all_events(count: int = COUNT) -> EventChunk:
     )
 
 
-def part_of(chunk: EventChunk, low: int, high: int) -> EventChunk:
-    """Events low to high, the last one not included."""
-    return chunk[low:high]
-
-
 def write_aedat4(path: Path) -> None:
     """Packets of 100 events, a trigger with each, a frame with every tenth."""
     streams = {
@@ -47,7 +42,7 @@ def write_aedat4(path: Path) -> None:
     whole = all_events()
     with Aedat4Writer(path, streams) as file:
         for number, low in enumerate(range(0, COUNT, PACKET)):
-            file._write(0, events_buffer(part_of(whole, low, low + PACKET)))
+            file._write(0, events_buffer(whole[low : low + PACKET]))
             t_us = int(whole.t_us[low])
             file.triggers(2, Triggers(np.array([t_us]), np.array([1], np.uint8)))
             if number % 10 == 0:
@@ -102,7 +97,7 @@ def write_mcap(path: Path, chunk_bytes: int = 2000) -> None:
             schema = writer.register_schema(kind, "ros2msg", ros2.definition(kind))
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for seq, low in enumerate(range(0, COUNT, PACKET)):
-            part = part_of(whole, low, low + PACKET)
+            part = whole[low : low + PACKET]
             t_ns = int(part.t_us[0]) * 1000
             data = ros2.event_packet(t_ns, "dvs", SIZE, seq, part)
             writer.add_message(channels["/dvs/events"], t_ns, data, t_ns, seq)

@@ -13,14 +13,10 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import Plugin, Plugins, plugins
 from sliplab.storage.formats import known
-from sliplab.storage.formats.export_trials import export_trials
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.known import export_formats, format_names, known_format, known_formats
+from sliplab.storage.formats.known import known_format, known_formats
 from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
-from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
 from tests.protocols.test_plugin import loaded
-from tests.storage.formats.recordings import COUNT, write_aedat4
+from tests.storage.formats.recordings import write_aedat4
 
 TICKS = """
 from functools import partial
@@ -37,15 +33,6 @@ def read(path, name):
         raise FormatError("is no file of ticks")
     rows = np.frombuffer(data[len(MAGIC):], np.int64).reshape(-1, 4)
     return ForeignTrial(name, path.name, lambda: iter([event_chunk(*rows.T)]), "start")
-
-def write(recording, path, stream):
-    with recording.open(stream) as reader:
-        found = reader.events()
-    rows = np.stack([found.x, found.y, found.p, found.t_us], axis=1).astype(np.int64)
-    path.write_bytes(MAGIC + rows.tobytes())
-    return {"events": len(found), "frames": 0, "triggers": 0}
-
-TICKS = Format((".tick",), lambda path, head: head.startswith(MAGIC), read, export=write)
 
 def both(files, name):
     one, two = (read(file, name) for file in sorted(files))
@@ -89,34 +76,6 @@ def declare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, P
     return put
 
 
-def test_format_of_another_package_is_imported_and_exported(declare: Any, tmp_path: Path) -> None:
-    declare(TICKS, Plugin(formats={"ticks": "lab_ticks:TICKS"}))
-    assert format_names()[-1] == "ticks"
-    assert export_formats() == ["aedat4", "dsec", "ticks"]
-    folder = tmp_path / "in"
-    folder.mkdir()
-    ticks(folder / "a.tick")
-    ticks(folder / "b")  # known by its first bytes
-    (folder / "c.tick").write_bytes(b"other")  # known by its ending
-    assert kind_of(folder) == "ticks"
-    write_aedat4(folder / "d.aedat4")
-    assert kind_of(folder) == MIXED
-    assert skipped_in(folder, "ticks")[0].file == "d.aedat4"
-    store = Store.create(tmp_path / "store")
-    done = import_trials(store, "theirs", trials_in(folder, MIXED), folder, MIXED)
-    assert done["imported"] == ["a", "b", "d"]
-    assert done["events"] == 20 + COUNT
-    (failed,) = done["failed"]
-    assert "is no file of ticks" in failed["reason"]
-    assert verify(store) == []
-    recording = store.campaign("theirs").recording("a")
-    assert recording.record.imported.format == "ticks"
-    export_trials([recording], tmp_path / "out", "ticks", "theirs")
-    assert (tmp_path / "out" / "a.tick").read_bytes() == (folder / "a.tick").read_bytes()
-    (again,) = trials_in(tmp_path / "out", kind_of(tmp_path / "out"))
-    assert sum(len(chunk) for chunk in again.events()) == 10
-
-
 def test_layout_of_another_package_joins_files(declare: Any, tmp_path: Path) -> None:
     hooks = {"layout": "lab_ticks:LAYOUT"}
     declare(TICKS, Plugin(formats={"halves": "lab_ticks:HALVES"}, hooks=hooks))
@@ -148,10 +107,10 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
 def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4")
     file, store = str(tmp_path / "a.aedat4"), str(tmp_path / "store")
-    found = loaded("import", file, "--store", store, "--name", "a")
+    (found,) = loaded(("import", file, "--store", store, "--name", "a"))
     assert "sliplab.plugins.formats.lab.layout" in found  # a run's folder may lie around the file
     for name in ("prophesee", "event_stream", "ros.mcap", "ros.bags", "lerobot"):
         assert f"sliplab.plugins.formats.{name}" not in found
     out = str(tmp_path / "out")
-    found = loaded("export", store, "a", "--format", "aedat4", "--output", out)
+    (found,) = loaded(("export", store, "a", "--format", "aedat4", "--output", out))
     assert not [name for name in found if name.startswith("sliplab.plugins.formats.")]

@@ -28,7 +28,6 @@ from tests.storage.formats.recordings import (
     FILES,
     PACKET,
     all_events,
-    part_of,
     write_aedat4,
     write_dsec,
     write_mcap,
@@ -231,7 +230,7 @@ def test_an_event_outside_of_the_camera_is_no_damage(tmp_path: Path) -> None:
     whole.x[wrong] = 640
     with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (640, 480), "camera")}) as file:
         for low in range(0, COUNT, PACKET):
-            file.events(0, part_of(whole, low, low + PACKET))
+            file.events(0, whole[low : low + PACKET])
     for outcome in _try(tmp_path, "aedat4", path.read_bytes()):
         expected = np.delete(whole.t_us, wrong)
         np.testing.assert_array_equal(outcome.found.events().t_us, expected)

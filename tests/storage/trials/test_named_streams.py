@@ -101,7 +101,7 @@ def test_nothing_is_made_where_nothing_comes(tmp_path: Path) -> None:
         assert reader.stream_counts() == {}
         assert not reader.has("streams")
     assert b"streams" not in (data[0] / "record.json").read_bytes()
-    with pytest.raises(StoreError, match="no wrenches 'force'; it has: none"):
+    with pytest.raises(StoreError, match="no wrench 'force'; it has: none"):
         Recording(data[0]).wrenches()
 
 

@@ -67,8 +67,7 @@ class ExampleEvents:
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns. Raises RigError as `read`."""
-        pulses = self._buffer.take("pulses")
-        return PulseChunk(np.concatenate(pulses) if pulses else np.empty(0, np.int64))
+        return PulseChunk.concatenate(self._buffer.take("pulses"))
 
     def stop(self) -> None:
         """Stop streaming; what has come can still be read."""
@@ -102,7 +101,7 @@ class ExampleEvents:
                     self._buffer.add("events", chunk, t_us)
                 elif kind == EDGES:
                     edges = np.frombuffer(self._exactly(count * EDGE.itemsize), EDGE)
-                    self._buffer.add("pulses", edges * 1000, edges)
+                    self._buffer.add("pulses", PulseChunk(edges * 1000), edges)
                 elif kind == START:
                     self._buffer.begin()
                     self._answered.set()

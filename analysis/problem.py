@@ -1,0 +1,425 @@
+"""What is to be told apart in recordings, and how: one class for each kind of problem.
+
+The steps that train, evaluate and report ask `problem_of` and know `Problem` alone. There are
+three: slip by events, slip by marker displacements (of rigs without events), and recordings that
+show classes of their own. A plug-in adds another one, most simply as a `ClassesOfRecordings` with
+classes and labels of its own.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any, ClassVar, cast
+
+from sliplab.analysis.campaigns import (
+    Collected,
+    agreeing,
+    class_names,
+    missing_stream,
+    of_classes,
+    training_campaigns,
+)
+from sliplab.analysis.detectors.predictions import count_spikes, predict_trials, seed_step
+from sliplab.analysis.evaluation import baselines, evaluation, markers, networks
+from sliplab.analysis.evaluation import classes as class_scores
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks import gradients, model_file, training
+from sliplab.analysis.networks.models import (
+    ModelOnDisk,
+    begun,
+    choose_model,
+    comparison_models,
+    wanted_class_models,
+    wanted_models,
+)
+from sliplab.analysis.report import pages
+from sliplab.analysis.report.classes import class_report_key
+from sliplab.analysis.trial_work import EachTrial, KeepTrials, in_order
+from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.analysis.windows.displacement import MarkerSamples, load_marker_samples
+from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
+from sliplab.storage.files import write_bytes, write_json
+from sliplab.storage.interrupts import uninterrupted
+from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
+from sliplab.storage.trials.store import StoreError
+
+Job = evaluation.EvaluationJob | class_scores.ClassJob | markers.MarkerJob
+"""Everything that an evaluation depends on, found before anything is computed."""
+Samples = SampleSet | MarkerSamples
+Watch = Callable[[ModelOnDisk], AbstractContextManager[Any]]
+"""Shows the training of a model while the block runs; `epoch` of its value takes each epoch."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """What does the work on many trials: this process, or a cluster.
+
+    Attributes:
+        each: makes the samples of a part of the split.
+        keep: makes and keeps the results of stale trials.
+        threads: of a network in one of them; None for as many as there are cores.
+    """
+
+    each: Callable[[str], EachTrial]
+    keep: KeepTrials
+    threads: int | None
+
+
+@dataclass(frozen=True)
+class Problem(ABC):
+    """What is to be told apart in the recordings of some campaigns.
+
+    Attributes:
+        name: of its evaluation among the results of the step.
+    """
+
+    name: ClassVar[str]
+    labels: StoreLabels
+    campaigns: list[Collected]
+
+    @abstractmethod
+    def models(self) -> list[ModelOnDisk]:
+        """Return the networks that the settings ask for, with the keys they must have.
+
+        Raises:
+            StoreError: a label is missing or stale, or there are no campaigns to train on.
+        """
+
+    @abstractmethod
+    def samples(self, split: str, each: EachTrial = in_order) -> Any:
+        """Return the labelled windows (`Samples`) of a part of the split.
+
+        Args:
+            each: makes those that are missing.
+        """
+
+    def check(self) -> None:  # noqa: B027
+        """Check that a network can be trained here.
+
+        Raises:
+            InputError: there is no such device to train on.
+        """
+
+    @abstractmethod
+    def train(self, model: ModelOnDisk, train: Any, validation: Any, watch: Watch) -> list[str]:
+        """Train a network and keep it; return what is to be said about it.
+
+        Args:
+            train, validation: `samples` of these parts.
+
+        Raises:
+            StoreError: there are too few samples.
+        """
+
+    @abstractmethod
+    def job(self, margin: float | None, smoothing: int | None) -> Job:
+        """Find the inputs of the evaluation.
+
+        Args:
+            margin, smoothing: of the rule, instead of the protocols' own and of chosen ones.
+
+        Raises:
+            StoreError: a network or a label is missing or stale.
+        """
+
+    @abstractmethod
+    def prepare(self, job: Any, workers: Workers) -> Mapping[str, Any]:
+        """Make and return what `evaluate` needs of many trials."""
+
+    @abstractmethod
+    def evaluate(self, job: Any, parts: Mapping[str, Any]) -> None:
+        """Evaluate, and keep one result under the job's key.
+
+        Args:
+            parts: of `prepare`.
+
+        Raises:
+            StoreError: there are no test samples.
+        """
+
+    def others(self) -> Sequence[networks.Judgement]:
+        """Return other networks that are judged on the same trials. By default none."""
+        return ()
+
+    @abstractmethod
+    def baselines(self) -> baselines.Methods:
+        """Return ordinary methods on the same windows.
+
+        Raises:
+            StoreError: there are no windows of events.
+        """
+
+    def report_key(self) -> str:
+        """Return the key of all inputs of the report.
+
+        Raises:
+            StoreError: there is no evaluation of this version, or a label is missing.
+        """
+        return pages.slip_report_key(self.labels.store, self.campaigns)
+
+    def page(
+        self, planned_bytes: Callable[[Collected], int], seconds: Mapping[str, float]
+    ) -> pages.Page:
+        """Return the report; see `report.pages.slip_page`."""
+        return pages.slip_page(self.labels.store, self.campaigns, planned_bytes, seconds)
+
+
+class EventProblem(Problem):
+    """A problem that a spiking network solves on windows of events."""
+
+    @abstractmethod
+    def used(self) -> list[Collected]:
+        """Return the campaigns whose trials train, choose and test; their windows agree."""
+
+    def check(self) -> None:
+        """See `Problem`."""
+        item, there = self.used()[0], gradients.devices()
+        device = item.settings.training.device
+        if device not in there:
+            right = f"not available here; must be one of {', '.join(there)}"
+            file = item.campaign.protocol_file
+            raise InputError(file, "analysis.training.device", device, right)
+
+    def train(
+        self, model: ModelOnDisk, train: SampleSet, validation: SampleSet, watch: Watch
+    ) -> list[str]:
+        """See `Problem`."""
+        for name, part in (("training", train), ("validation", validation)):
+            if not len(part):
+                raise StoreError(f"there are no {name} samples; collect more trials")
+        settings = model.settings
+        model.path.parent.mkdir(parents=True, exist_ok=True)
+        with watch(model) as display:
+            fitted = training.fit(
+                train.windows,
+                train.y,
+                validation.windows,
+                validation.y,
+                settings.network,
+                settings.windows,
+                settings.training,
+                model.seed,
+                on_epoch=display.epoch,
+                on_state=partial(write_bytes, model.state_path),
+                state=begun(model),
+                classes=model.classes or CLASSES,
+            )
+        _keep(model, fitted, ModelSamples(train=len(train), validation=len(validation)))
+        said = [f"warning: {warning}" for warning in fitted.warnings]
+        if model.classes:
+            said.append(
+                f"{model.title}: {len(train)} windows of {len(model.classes)} classes; epoch "
+                f"{fitted.chosen_epoch}, validation {100 * fitted.chosen.val_strict:.1f} %"
+            )
+        return said
+
+
+@uninterrupted
+def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) -> None:
+    """Write a network and its description, and delete the states of its training."""
+    model_file.save(model.path, fitted)
+    info = TrainedModel(
+        key=model.key,
+        seed=model.seed,
+        samples=samples,
+        chosen_epoch=fitted.chosen_epoch,
+        validation=ValidationAccuracy(
+            argmax=fitted.chosen.val_argmax,
+            strict=fitted.chosen.val_strict,
+            margin=fitted.chosen.val_margin,
+        ),
+        warnings=fitted.warnings,
+    )
+    write_json(model.info_path, info.to_json())
+    for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
+        left.unlink()
+
+
+class SlipByEvents(EventProblem):
+    """No slip, incipient and gross slip, by a spiking network on events."""
+
+    name = evaluation.NAME
+
+    def used(self) -> list[Collected]:
+        """See `EventProblem`; the kinematic ones."""
+        return training_campaigns(self.campaigns)
+
+    def models(self) -> list[ModelOnDisk]:
+        """See `Problem`; also those that `analysis.also` names."""
+        given = self.labels.store, self.campaigns, self.labels.reviewed
+        return [*wanted_models(*given), *comparison_models(*given)]
+
+    def samples(self, split: str, each: EachTrial = in_order) -> SampleSet:
+        """See `Problem`."""
+        return load_samples(self.labels, self.campaigns, split, each)
+
+    def job(self, margin: float | None, smoothing: int | None) -> evaluation.EvaluationJob:
+        """See `Problem`."""
+        store, reviewed = self.labels.store, self.labels.reviewed
+        self.used()
+        return evaluation.make_job(store, self.campaigns, margin, smoothing, reviewed)
+
+    def prepare(self, job: evaluation.EvaluationJob, workers: Workers) -> dict[str, SampleSet]:
+        """Count missing spikes, and load training and test samples."""
+        store, keep, threads = job.store, workers.keep, workers.threads
+        trials = [(item.name, recording, key) for item, _, recording, key in job.trials]
+        count_spikes(store, job.model.path, trials, keep, threads)
+        for model, item in product(job.others, job.campaigns):
+            count_spikes(
+                store,
+                model.path,
+                job.counted_by(model, item),
+                keep,
+                threads,
+                seed_step(model.seed),
+                job.detection[item.name].stride_ms,
+            )
+        windows = self.used()[0].settings.windows
+        predict_trials(store, job.model.path, windows, job.detectors.requests, keep, threads)
+        return {split: self.samples(split, workers.each(split)) for split in ("train", "test")}
+
+    def evaluate(self, job: evaluation.EvaluationJob, parts: Mapping[str, SampleSet]) -> None:
+        """See `Problem`."""
+        evaluation.score_store(job, parts["train"], parts["test"])
+
+    def others(self) -> Sequence[networks.Judgement]:
+        """Return the networks that `analysis.also` names.
+
+        Raises:
+            StoreError: one is missing or stale.
+        """
+        return networks.comparison_judgements(self.labels, self.campaigns)
+
+    def baselines(self) -> baselines.Methods:
+        """See `Problem`."""
+        return baselines.slip_methods()
+
+
+class ClassesOfRecordings(EventProblem):
+    """Classes that recordings show, by a spiking network on events."""
+
+    name = class_scores.NAME
+
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the classes, by the numbers that samples carry.
+
+        Raises:
+            StoreError: there are fewer than two.
+        """
+        return class_names(self.campaigns)
+
+    def used(self) -> list[Collected]:
+        """See `EventProblem`; all."""
+        return agreeing(self.campaigns)
+
+    def models(self) -> list[ModelOnDisk]:
+        """See `Problem`."""
+        return wanted_class_models(self.labels, self.campaigns, self.classes())
+
+    def samples(self, split: str, each: EachTrial = in_order) -> SampleSet:
+        """See `Problem`."""
+        return load_class_samples(self.labels, self.campaigns, split, each, self.classes())
+
+    def job(self, margin: float | None, smoothing: int | None) -> class_scores.ClassJob:
+        """See `Problem`.
+
+        Raises:
+            InputError: a rule of detection is given, which belongs to slip.
+        """
+        shown = f"sets how slip is detected, and '{self.campaigns[0].name}' shows classes"
+        for option, value in (("--margin", margin), ("--smoothing", smoothing)):
+            if value is not None:
+                raise InputError(option, "", value, f"{shown}; leave it out")
+        return class_scores.make_class_job(
+            self.labels, self.campaigns, self.classes(), self.models()
+        )
+
+    def prepare(self, job: class_scores.ClassJob, workers: Workers) -> dict[str, SampleSet]:
+        """Load the samples of every part of the split."""
+        return {split: self.samples(split, workers.each(split)) for split in class_scores.SPLITS}
+
+    def evaluate(self, job: class_scores.ClassJob, parts: Mapping[str, SampleSet]) -> None:
+        """See `Problem`."""
+        class_scores.evaluate_classes(job, parts)
+
+    def baselines(self) -> baselines.Methods:
+        """See `Problem`."""
+        return baselines.class_methods(self.campaigns, len(self.classes()))
+
+    def report_key(self) -> str:
+        """See `Problem`."""
+        return class_report_key(self.labels.store, self.campaigns)
+
+    def page(
+        self, planned_bytes: Callable[[Collected], int], seconds: Mapping[str, float]
+    ) -> pages.Page:
+        """See `Problem`."""
+        store = self.labels.store
+        reviewed = class_scores.class_evaluation_of(store).reviewed is not None
+        models = replace(self, labels=replace(self.labels, reviewed=reviewed)).models()
+        return pages.class_page(store, self.campaigns, choose_model(models))
+
+
+class SlipByMarkers(Problem):
+    """No slip, incipient and gross slip, by a classifier on marker displacements."""
+
+    name = evaluation.NAME
+
+    def models(self) -> list[ModelOnDisk]:
+        """See `Problem`."""
+        return markers.wanted_marker_models(self.labels, self.campaigns)
+
+    def samples(self, split: str, each: EachTrial = in_order) -> MarkerSamples:
+        """See `Problem`; they take seconds on this machine."""
+        return load_marker_samples(self.labels, self.campaigns, split)
+
+    def train(
+        self, model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples, watch: Watch
+    ) -> list[str]:
+        """See `Problem`."""
+        net = markers.train_marker_model(model, train, validation)
+        strict = model.info.validation.strict
+        shown = "" if strict is None else f", validation {100 * strict:.1f} %"
+        return [f"{model.title}: {net.title}; epoch {net.chosen_epoch}{shown}"]
+
+    def job(self, margin: float | None, smoothing: int | None) -> markers.MarkerJob:
+        """See `Problem`."""
+        return markers.make_marker_job(self.labels, self.campaigns, margin, smoothing)
+
+    def prepare(self, job: markers.MarkerJob, workers: Workers) -> dict[str, Any]:
+        """See `Problem`; nothing is needed."""
+        return {}
+
+    def evaluate(self, job: markers.MarkerJob, parts: Mapping[str, Any]) -> None:
+        """See `Problem`."""
+        markers.evaluate_markers(job)
+
+    def baselines(self) -> baselines.Methods:
+        """See `Problem`."""
+        training_campaigns(self.campaigns)  # raises
+        return baselines.slip_methods()
+
+
+def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
+    """Return the problem that campaigns pose: one of a plug-in, where it takes them, or ours.
+
+    Raises:
+        InputError: some show classes and some show slip.
+        PluginError: one of a plug-in cannot be imported.
+    """
+    for place in plugins().declared("problems").values():
+        if (found := import_foreign(place)(labels, campaigns)) is not None:
+            return cast("Problem", found)
+    if of_classes(campaigns):
+        return ClassesOfRecordings(labels, campaigns)
+    kind = SlipByMarkers if missing_stream(campaigns) == "events" else SlipByEvents
+    return kind(labels, campaigns)
