@@ -23,7 +23,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import format_names
 from sliplab.storage.formats.recognition import entered, kind_of, skipped_in, trials_in
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError, refuse_url
 
 
 def import_data(
@@ -56,6 +56,7 @@ def import_data(
             imported, and those before a wrong one stay.
         Locked: another program writes into the store.
     """
+    refuse_url(path)
     if adapter is not None:
         for option, given in (("KIND", kind is not None), ("--simulated", simulated)):
             if given:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +10,6 @@ import typer
 
 from sliplab.flows.running import console
 from sliplab.flows.steps import located, prepare_store, run_step
-from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
@@ -21,29 +19,8 @@ PLAN, COLLECT, RIG, ANALYSE, DATA = "Plan", "Collect", "Rig", "Analyse", "Data"
 RESEARCH = "Research"
 """Panels of the help; commands of plug-ins are among those of research if they name no other."""
 
-_URL = re.compile("([a-z][a-z0-9+.]+):/+(.*)")
-
-
-def path_only(name: str) -> Callable[[Path | None], Path | None]:
-    """Return the check of an option or argument `name` that a path is no URL.
-
-    It raises InputError with the URL, of which a path has lost a slash.
-    """
-
-    def check(path: Path | None) -> Path | None:
-        if path is not None and (found := _URL.fullmatch(str(path))):
-            right = "must be a path: `sliplab pull URL FOLDER` downloads a pushed store"
-            slashes = "///" if found[1] == "file" else "//"
-            raise InputError(name, "", f"{found[1]}:{slashes}{found[2]}", right)
-        return path
-
-    return check
-
-
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
-StoreArgument = Annotated[
-    Path, typer.Argument(metavar="STORE", help="A store's folder.", callback=path_only("STORE"))
-]
+StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="A store's folder.")]
 PlaceArgument = Annotated[
     str,
     typer.Argument(
@@ -59,12 +36,7 @@ RigOption = Annotated[
     typer.Option("--rig", help="A rig file (YAML), or the name of a built-in rig such as mock."),
 ]
 StoreOption = Annotated[
-    Path,
-    typer.Option(
-        "--store",
-        help="The store's folder; created if missing.",
-        callback=path_only("--store"),
-    ),
+    Path, typer.Option("--store", help="The store's folder; created if missing.")
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object to stdout, everything else to stderr.")

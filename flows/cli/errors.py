@@ -68,7 +68,7 @@ _EXPECTED = {
     "MainModuleError",
 }
 """Errors that need no traceback, by name: their modules are slow to import."""
-_OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|PATH|STORE|TRIAL|URL|WHAT")
+_OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|STORE|TRIAL|URL|WHAT")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import DATA, JsonOption, StoreOption, finish, path_only
+from sliplab.flows.cli.common import DATA, JsonOption, StoreOption, finish
 from sliplab.flows.running import console, exit_codes
 
 app = typer.Typer()
@@ -60,8 +60,6 @@ def import_(
     labels and factors, from a folder or .zip, as a campaign to train and evaluate on
     (docs/adapters.md).
     """
-    for given_path in (path, Path(kind_or_path)):
-        path_only("PATH")(given_path)
     from sliplab.flows.imports import import_data
 
     source = Path(kind_or_path) if path is None else path

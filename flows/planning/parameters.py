@@ -91,8 +91,7 @@ class Requester(StrictModel):
 
     def arguments(self) -> dict[str, Any]:
         """Return them as arguments of the functions in `collecting.requests`."""
-        given = self.model_dump()
-        return {**given, "limit_s": given.pop("wait_s")}
+        return {"limit_s": self.wait_s, **self.model_dump(exclude={"wait_s"})}
 
 
 class Ask(Requester, Reason):

@@ -74,6 +74,13 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
 
+def refuse_url(path: Path) -> None:
+    """Check that a path was not given as a URL. Raises NoStore."""
+    if _URL.match(str(path)):
+        text = "give a folder, then `sliplab push FOLDER URL`, or first `sliplab pull URL FOLDER`"
+        raise NoStore(path, f"is a URL, not a folder; {text}")
+
+
 def known_cause(folder: Path) -> Json | None:
     """Return why a folder is, or is to be, in quarantine; None if that is not known."""
     try:
@@ -401,6 +408,7 @@ class Store:
             NoStore: no store there.
             StoreError: one of another format, or a damaged one.
         """
+        refuse_url(folder)
         path = folder / STORE
         if not path.is_file():
             raise NoStore(folder, "is not a store (no store.json); `sliplab collect` creates one")
@@ -435,9 +443,7 @@ class Store:
         Raises:
             NoStore: it is a URL, a file, or a folder that holds something else.
         """
-        if _URL.match(str(folder)):
-            text = "is a URL, not a folder; give a folder, then `sliplab push FOLDER URL`"
-            raise NoStore(folder, text)
+        refuse_url(folder)
         if (folder / STORE).exists():
             return True
         if folder.exists() and not folder.is_dir():

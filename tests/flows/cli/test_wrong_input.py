@@ -13,6 +13,7 @@ import yaml
 
 from sliplab.flows.cli.app import command_line
 from sliplab.protocols.shown import MASK
+from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
 
@@ -145,11 +146,11 @@ def test_levels_to_be_enabled(given: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("holdout", "s3://bucket/x"), "STORE = s3://bucket/x: must be a path"),
-        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "--store = s3://b/x: must be"),
+        (("holdout", "s3://bucket/x"), "s3:/bucket/x: is a URL, not a folder"),
+        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "s3:/b/x: is a URL"),
         (
             ("import", "file:///x", "--store", "x", "--name", "x"),
-            "PATH = file:///x: must be a path",
+            "file:/x: is a URL",
         ),
         (("evaluate", "x", "--margin", "nan"), "--margin = nan: must be a number"),
         (("pause", "x", "--wait", "-1"), "--wait = -1: must be greater than or equal to 0"),
@@ -161,3 +162,12 @@ def test_option_or_argument_of_another_kind_is_refused(words: tuple[str, ...], s
 
 def test_schema_without_a_kind_lists_the_kinds() -> None:
     assert here("schema").stdout.split()[:3] == ["protocol", "rig", "adapter"]
+
+
+def test_requests_pass_their_options_on(tmp_path: Path) -> None:
+    folder = Store.create(tmp_path / "store").folder
+    for words in (("pause", folder, "--why", "lunch", "--wait", "1"), ("resume", folder)):
+        done = here(*words, "--who", "anna", "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["who"] == "anna"
+    assert here("stop", folder, "--wait", "1").returncode == 0
