@@ -31,7 +31,7 @@ _MOST_CELLS = 1 << 14
 """Cells of a row."""
 _SEPARATORS = "\t;, "
 _QUOTED = re.compile('"[^"]*"')
-_BLOCK_BYTES, _ROWS = 1 << 22, 1 << 18
+_BLOCK_BYTES, _ROWS = 1 << 21, 1 << 18
 """Bytes of CSV and rows of numpy's arrays that are read at once."""
 _TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
 
