@@ -39,9 +39,11 @@ if TYPE_CHECKING:
     from sliplab.analysis.networks.training import Fitted
     from sliplab.analysis.report.page import Figure
     from sliplab.analysis.windows.sparse import SparseWindows
+    from sliplab.flows.log import LogEntry
     from sliplab.flows.notebook.datasets import EventDataset
     from sliplab.flows.notebook.torch_windows import TorchWindows
     from sliplab.flows.planning.preflight import Checks
+    from sliplab.flows.status import StoreStatus
     from sliplab.flows.steps import StepResult
     from sliplab.flows.verify import Verification
     from sliplab.protocols.windows import Windows
@@ -287,6 +289,35 @@ class Store:
         import pandas as pd
 
         return pd.read_parquet(self._reported("scores.parquet"))
+
+    def status(self) -> StoreStatus:
+        """Who collects, how far each campaign is, and when it is likely to end.
+
+        Raises:
+            StoreError: the store is damaged.
+        """
+        from sliplab.flows.status import StatusReader
+
+        return StatusReader(self._store).read()
+
+    def log(self) -> list[LogEntry]:
+        """What people and programs did to the store, oldest first; damaged files are left out."""
+        from sliplab.flows.log import log_entries
+
+        return log_entries(self._store)
+
+    def note(self, text: str, *, who: str = "") -> LogEntry:
+        """Add a note to the log.
+
+        Args:
+            who: empty for the user that is logged in.
+
+        Raises:
+            ValueError: the text is empty or too long.
+        """
+        from sliplab.flows.log import add_note
+
+        return add_note(self._store, text, who=who)
 
     def models(self) -> list[Path]:
         """Files of the networks that were trained here."""

@@ -8,6 +8,7 @@ from uuid import uuid4
 
 import pytest
 
+import sliplab
 from sliplab.flows.log import MOST_CHARACTERS, add_note, log_entries
 from sliplab.flows.running import run_records
 from sliplab.storage.errors import StoreError
@@ -55,6 +56,14 @@ def test_a_damaged_file_is_named_and_hides_no_other(tmp_path: Path) -> None:
     faults: list[str] = []
     assert [entry.text for entry in log_entries(store, faults)] == ["second"]
     assert "000001.json" in faults[0]
+
+
+def test_a_notebook_reads_the_status_and_the_log_and_adds_a_note(tmp_path: Path) -> None:
+    Store.create(tmp_path / "s")
+    store = sliplab.open_store(tmp_path / "s")
+    entry = store.note("new skin", who="anna")
+    assert store.log() == [entry]
+    assert (store.status().running, store.status().campaigns) == (None, [])
 
 
 def test_notes_made_at_once_are_all_kept(tmp_path: Path) -> None:
