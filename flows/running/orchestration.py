@@ -418,7 +418,7 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
             client = stack.enter_context(link.client())
             if _store is not None:
                 run_records.close_killed_runs(_store, link.server, client)
-            name = flow.name if _store is None else f"{flow.name} {_store.name}"
+            name = flow.name if _store is None else f"{flow.name} {_in_utf8(_store.name)}"
             flow_run = client.create_flow_run(flow, name=name)
         except Exception as error:
             if cluster is not None:
@@ -429,6 +429,11 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
             link.mark_lost(str(error) if isinstance(error, ServerError) else error)
             return _without_server(work, argument)
         return _reported(flow, flow_run, argument, work, link, cluster)
+
+
+def _in_utf8(name: str) -> str:
+    """Return the name of a folder for the server; it need not be UTF-8 on the disk."""
+    return name.encode(errors="replace").decode()
 
 
 def _reported(

@@ -53,7 +53,8 @@ class FurtherFrameCamera(MockFrameCameraSettings, FurtherDevice):
         if stream.scale_px_per_mm != self.px_per_mm:
             text = f"must be mock.px_per_mm = {self.px_per_mm:g}"
             yield KeyedError(".scale_px_per_mm", stream.scale_px_per_mm, text)
-        if stream.rate_hz is not None and stream.rate_hz != self.rate_hz:
+        by_itself = stream.timing.grade != "hardware trigger"  # else the rate has no meaning
+        if by_itself and stream.rate_hz is not None and stream.rate_hz != self.rate_hz:
             text = f"must be mock.rate_hz = {self.rate_hz:g}"
             yield KeyedError(".rate_hz", stream.rate_hz, text)
 

@@ -372,7 +372,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
         raise _Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("sliplab.flows.train.write_bytes", write_and_die)
+        patched.setattr("sliplab.analysis.problem.write_bytes", write_and_die)
         with pytest.raises(_Killed):
             train(store, collected(store))
     assert len(list(models.glob("*.state"))) == 1

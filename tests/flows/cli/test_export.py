@@ -21,6 +21,7 @@ def test_every_form_is_known() -> None:
         "aedat4",
         "dsec",
         "labels",
+        "samples",
         "croissant",
         "mcap",
         "lerobot",

@@ -100,7 +100,7 @@ def test_without_processes_a_collection_ends_in_one_line(
         raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
     monkeypatch.setattr("sliplab.flows.running.orchestration._servers", {})
-    monkeypatch.setattr("sliplab.flows.running.embedded_server.subprocess.Popen", fork)
+    monkeypatch.setattr("sliplab.flows.running.embedded_server.Child", fork)
     words = (*PLAN, "--rig", "rehearsal", "--store", tmp_path / "s", "--trials", 1)
     done = here("collect", *words, "--json")
     error = json.loads(done.stdout)["error"]
