@@ -149,7 +149,7 @@ def changes() -> str:
 
 def protocol_file() -> str:
     """Every key of a protocol file."""
-    from sliplab.flows.planning.schema import file_schema
+    from sliplab.flows.planning.json_schemas import file_schema
 
     schema = file_schema("protocol")
     return f"""# Protocol files
@@ -162,7 +162,7 @@ together, and how an editor completes and checks them with [the schema](../schem
 
 def rig_file() -> str:
     """Every key of a rig file."""
-    from sliplab.flows.planning.schema import file_schema
+    from sliplab.flows.planning.json_schemas import file_schema
 
     models = file_schema("rig")["definitions"]
     return f"""# Rig files
@@ -188,7 +188,7 @@ def driver_rules() -> str:
 
 def document(kind: str) -> str:
     """Every key of a document in a store."""
-    from sliplab.flows.planning.schema import file_schema
+    from sliplab.flows.planning.json_schemas import file_schema
 
     title, text = _DOCUMENTS[kind]
     schema = file_schema(kind)

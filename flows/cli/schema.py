@@ -30,7 +30,7 @@ def schema(
     as_json: JsonOption = False,
 ) -> None:
     """Print the JSON Schema of a protocol, a rig file, an adapter or a document in a store."""
-    from sliplab.flows.planning.schema import file_schema, kinds
+    from sliplab.flows.planning.json_schemas import file_schema, kinds
     from sliplab.storage.files import make_folder, write_json
 
     if kind is None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft7Validator
 
-from sliplab.flows.planning.schema import DOCUMENTS, file_schema
+from sliplab.flows.planning.json_schemas import DOCUMENTS, file_schema
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import DocumentError
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from jsonschema import Draft7Validator
 
-from sliplab.flows.planning.schema import document_model, file_schema, kinds
+from sliplab.flows.planning.json_schemas import document_model, file_schema, kinds
 from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol

@@ -20,7 +20,7 @@ from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_class_samples
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
-from sliplab.flows.planning.schema import file_schema
+from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.report import report
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines

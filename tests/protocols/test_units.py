@@ -189,7 +189,7 @@ def test_the_schema_for_editors_knows_units_of_packages(install: Any, tmp_path: 
     install(f"UNITS = {INCH}\n", name="inches")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'inches')!r})\n"
-        "import json; from sliplab.flows.planning.schema import file_schema\n"
+        "import json; from sliplab.flows.planning.json_schemas import file_schema\n"
         "print(json.dumps(file_schema('protocol')))"
     )
     models = json.loads(said_by(code))["definitions"]

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 import sliplab
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.flows.cli.app import command_line
+from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.planning.preflight import check
-from sliplab.flows.planning.schema import file_schema
 from sliplab.flows.scene_runs import changed
 from sliplab.plugins.twin import calibrate, worlds
 from sliplab.plugins.twin.camera_estimates import NOISE_TREND

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import sliplab
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.flows.cli.app import command_line
-from sliplab.flows.planning.schema import file_schema
+from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.plugins.twin import worlds
 from sliplab.plugins.twin.calibrate import fitted_rig
 from sliplab.plugins.twin.drift import flow as drift

@@ -14,8 +14,8 @@ from jsonschema import Draft7Validator
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.study import Finding
 from sliplab.flows.judge_network import judge_model
+from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.planning.schema import file_schema
 from sliplab.flows.study import StudyOutcome
 from sliplab.plugins.twin.document import TwinGap
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_samples
