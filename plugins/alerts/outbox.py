@@ -1,7 +1,7 @@
 """Messages on their way, as files of the store: none is lost when a receiver or we are down.
 
     STORE/alerts/began.json      when alerts began: what is older is not told
-    STORE/alerts/KEY.json        an event, and to whom it was sent when
+    STORE/alerts/KEY.json        an event, to whom it goes, and when each took it
 
 An event is written before it is sent, under a name made of its key: it is told once, however often
 it is found. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
@@ -72,8 +72,9 @@ class Outbox:
         self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
         self._lines = [_Line(target, _digest(target.name)) for target in targets]
         self._most, self._say = most_per_hour, say
-        self._waiting = {path: read_json(path) for path in self._files()}
-        self._known = set(self._waiting)
+        files = {path: read_json(path) for path in self._files()}
+        self._known = set(files)
+        self._waiting = {path: data for path, data in files.items() if self._waits(data)}
 
     def add(self, event: Event, urgent: bool) -> bool:
         """Keep an event to be sent; False if it is known, or older than the alerts."""
@@ -86,7 +87,7 @@ class Outbox:
             "text": event.text,
             "when": _utc(event.since),
             "urgent": urgent,
-            "sent": {},
+            "sent": {line.key: None for line in self._lines},
         }
         self._known.add(path)
         if not write_new_json(path, data):
@@ -109,7 +110,7 @@ class Outbox:
             events = {
                 path: data
                 for path, data in sorted(self._waiting.items(), key=lambda pair: pair[1]["when"])
-                if line.key not in data["sent"] and (data["urgent"] or not quiet)
+                if _unsent(data, line) and (data["urgent"] or not quiet)
             }
             if events:
                 work.append((line, events))
@@ -136,11 +137,19 @@ class Outbox:
             data = self._waiting[path]
             data["sent"][line.key] = _utc(now)
             write_json(path, data)
-            if all(each.key in data["sent"] for each in self._lines):
+            if not self._waits(data):
                 del self._waiting[path]
+
+    def _waits(self, data: Json) -> bool:
+        return any(_unsent(data, line) for line in self._lines)
 
     def _files(self) -> list[Path]:
         return sorted(path for path in self._folder.glob("*.json") if path.name != BEGAN)
+
+
+def _unsent(data: Json, line: _Line) -> bool:
+    """Return whether an event goes to a target, of those when it happened, that has not taken it."""
+    return line.key in data["sent"] and data["sent"][line.key] is None
 
 
 def _text(events: Iterable[Json]) -> str:

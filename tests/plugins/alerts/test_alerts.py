@@ -182,6 +182,20 @@ def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
     assert receiver.taken == ["new"]
 
 
+def test_an_address_that_is_added_later_is_told_nothing_of_before(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "s")
+    first, second = Receiver("json://a", up=False), Receiver("json://b")
+    box = Outbox(store, [first], 30, NOW, lambda text: None)
+    box.add(Event("a", "paused", "before", NOW), urgent=True)
+    box.send("t", NOW)
+    first.up = True
+    later = NOW + timedelta(hours=1)
+    box = Outbox(store, [first, second], 30, later, lambda text: None)
+    box.add(Event("b", "paused", "after", later), urgent=True)
+    box.send("t", later)
+    assert (first.taken, second.taken) == (["before\nafter"], ["after"])
+
+
 def test_quiet_hours_hold_all_but_urgent_messages(tmp_path: Path) -> None:
     quiet = settings(quiet={"from": "22:00", "until": "07:00"}, timezone="Europe/Rome")
     assert quiet.is_quiet(NOW)
