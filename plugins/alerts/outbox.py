@@ -148,7 +148,7 @@ class Outbox:
 
 
 def _unsent(data: Json, line: _Line) -> bool:
-    """Return whether an event goes to a target, of those when it happened, that has not taken it."""
+    """Return whether an event goes to a target that has not taken it; not to ones added later."""
     return line.key in data["sent"] and data["sent"][line.key] is None
 
 
