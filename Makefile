@@ -48,12 +48,11 @@ test-core: $(DONE)
 test-programs: $(DONE)
 	$(PYTEST) -n 3 --dist loadgroup --no-loadscope-reorder -m 'programs and not realtime and not long'
 
-# fakes in real time: whole scenes, which compute, one after another; beside them the rest, which
-# waits. A shared machine may stop a process for longer than a device's silence: what failed must
-# pass alone.
+# fakes in real time: whole scenes, which compute, one after another; beside them the rest. A shared
+# machine may stop a process for longer than a device's silence: what failed must pass alone.
 REALTIME := -m 'realtime and not long'
 test-realtime: $(DONE)
-	$(PYTEST) -n 3 --dist loadgroup $(REALTIME) || $(PYTEST) --last-failed --last-failed-no-failures none $(REALTIME)
+	$(PYTEST) -n 2 --dist loadgroup $(REALTIME) || $(PYTEST) --last-failed --last-failed-no-failures none $(REALTIME)
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)

@@ -39,7 +39,7 @@ def _write_in_memory() -> None:
         return
     folder = tempfile.mkdtemp("", "", MEMORY)  # short: names of sockets have a limit
     os.chmod(folder, 0o755)  # PostgreSQL runs as a user of its own
-    os.environ["TMPDIR"] = folder
+    os.environ["TMPDIR"] = tempfile.tempdir = folder  # pytest has asked for the folder before
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
 
 
