@@ -146,8 +146,9 @@ def failure(error: Exception) -> Failure:
         return Failure(f"{place}: {stated}", exit_codes.FAILED, place)
     if isinstance(error, OSError) and error.errno in _NAMES:
         place = os.fsdecode(error.filename2 or error.filename or "")
-        shown = place if len(place) <= LONGEST_SHOWN else f"{place[:LONGEST_SHOWN]}..."
-        return Failure(f"{shown}: {_NAMES[error.errno]}", exit_codes.WRONG_INPUT, shown or None)
+        if error.errno == errno.ENAMETOOLONG and len(place) > LONGEST_SHOWN:
+            place = f"{place[:LONGEST_SHOWN]}..."
+        return Failure(f"{place}: {_NAMES[error.errno]}", exit_codes.WRONG_INPUT, place or None)
     if isinstance(error, OSError) and error.filename:
         # of a copy the second file is the one that is written
         place = os.fsdecode(error.filename2 or error.filename)
