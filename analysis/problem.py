@@ -111,7 +111,7 @@ class Problem(ABC):
 
     @abstractmethod
     def train(self, model: ModelOnDisk, train: Any, validation: Any, watch: Watch) -> list[str]:
-        """Train a network and keep it; return what is to be said about it.
+        """Train a network and keep it; return messages about it.
 
         Args:
             train, validation: `samples` of these parts.
@@ -214,13 +214,13 @@ class EventProblem(Problem):
                 classes=model.classes or CLASSES,
             )
         _keep(model, fitted, ModelSamples(train=len(train), validation=len(validation)))
-        said = [f"warning: {warning}" for warning in fitted.warnings]
+        messages = [f"warning: {warning}" for warning in fitted.warnings]
         if model.classes:
-            said.append(
+            messages.append(
                 f"{model.title}: {len(train)} windows of {len(model.classes)} classes; epoch "
                 f"{fitted.chosen_epoch}, validation {100 * fitted.chosen.val_strict:.1f} %"
             )
-        return said
+        return messages
 
 
 @uninterrupted

@@ -2,7 +2,7 @@
 
     STORE/log/000001.json   a note: who, when, text
 
-All else stands where it has its use, and is read from there: requests and their answers
+Everything else is read from where it is used: requests and their answers
 (`storage.trials.control`), flow runs (`flows.running.run_records`), sessions at the rig, attempts
 in quarantine, decisions about labels (`storage.trials.review`) and registrations. Nothing is
 written twice.
@@ -29,7 +29,6 @@ from sliplab.storage.trials.store import AGAIN, CAUSE, Campaign, Store
 FOLDER = "log"
 MOST_CHARACTERS = 10_000
 """Length of a note."""
-_MOST_TRIES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +69,8 @@ def add_note(store: Store, text: str, *, who: str = "") -> LogEntry:
     if len(text) > MOST_CHARACTERS:
         raise ValueError(f"has {len(text)} characters: must have {MOST_CHARACTERS} at most")
     signed = signature(who, "")
-    journal = Journal(inside(store.folder / FOLDER, store.folder))
-    number = max(journal.numbers(), default=0)
-    for _ in range(_MOST_TRIES):
-        number += 1
-        if journal.add(number, {**signed, "text": text}):
-            return LogEntry(when=signed["when"], who=signed["who"], what="note", text=text)
-    raise OSError(f"{journal.folder}: no free number")
+    Journal(inside(store.folder / FOLDER, store.folder)).append({**signed, "text": text})
+    return LogEntry(when=signed["when"], who=signed["who"], what="note", text=text)
 
 
 def log_entries(store: Store, unreadable: list[str] | None = None) -> list[LogEntry]:

@@ -11,7 +11,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +25,6 @@ from sliplab.protocols import InputError, Plan
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.process import named
-from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE, incomplete
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
@@ -68,13 +67,18 @@ class Drift:
 
     Attributes:
         key: of the protocol's ``gates.reference``.
-        percent: change; bound_percent: largest that the protocol allows.
+        percent: change; None if it is not known, which counts as too much.
+        bound_percent: largest change that the protocol allows.
     """
 
     key: str
-    percent: float
+    percent: float | None
     bound_percent: float
     trial: str
+
+    def reaches(self, share: float = 1.0) -> bool:
+        """Return whether the change is as large as a share of what the protocol allows."""
+        return self.percent is None or abs(self.percent) >= share * self.bound_percent
 
 
 @dataclass(frozen=True)
@@ -250,7 +254,12 @@ class StatusReader:
         key = (campaign.name, *known[:1], *known[-1:])
         if key not in self._drift:
             self._drift[key] = [
-                Drift(item.key, item.percent, item.bound_percent, item.trial)
+                Drift(
+                    item.key,
+                    item.percent if math.isfinite(item.percent) else None,
+                    item.bound_percent,
+                    item.trial,
+                )
                 for item in last_drift(plan, campaign, committed)
             ]
         return self._drift[key]
@@ -335,8 +344,3 @@ def _moment(path: Path) -> datetime | None:
 
 def _utc(moment: datetime) -> str:
     return moment.astimezone(UTC).isoformat(timespec="seconds")
-
-
-def as_json(status: StoreStatus) -> Json:
-    """Return the state as one JSON object."""
-    return asdict(status)

@@ -33,7 +33,6 @@ def status(
     """Show who collects, how far each campaign is, when it ends, and what needs a person."""
     from sliplab.flows.running import stopping
     from sliplab.flows.status import StatusReader
-    from sliplab.flows.status import as_json as plain
     from sliplab.protocols.errors import InputError
     from sliplab.storage.trials.store import Store
 
@@ -42,7 +41,7 @@ def status(
     reader = StatusReader(Store.open(store))
     found = reader.read()
     if as_json:
-        console.print_json(plain(found))
+        console.print_json(vars(found))
         return
     _print(found)
     while watch:
@@ -150,9 +149,10 @@ def _campaign_lines(item: CampaignStatus) -> list[str]:
             f"{console.size(needed)}"
         )
     for drift in item.drift:
-        over = " (TOO MUCH)" if not abs(drift.percent) <= drift.bound_percent else ""
+        over = " (TOO MUCH)" if drift.reaches() else ""
+        change = "not known" if drift.percent is None else f"{drift.percent:+.1f} %"
         lines.append(
-            f"  drift     {drift.key} {drift.percent:+.1f} % since the first reference trial, "
+            f"  drift     {drift.key} {change} since the first reference trial, "
             f"{drift.bound_percent:g} % allowed{over}"
         )
     for trial in item.excluded:

@@ -1,4 +1,4 @@
-"""The program that sends a service's alerts: a child of its own, so that nothing waits for it."""
+"""Runs the program that sends a service's alerts as a child, so that nothing waits for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Alerts: messages about a campaign to people who are not beside it, by mail, chat or telephone."""
+"""Alerts: messages about a campaign to people who are not there, by mail, chat or telephone."""
 
 from __future__ import annotations
 

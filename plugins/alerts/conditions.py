@@ -36,10 +36,10 @@ GRADES = (
 
 @dataclass(frozen=True)
 class Event:
-    """Something to be told.
+    """Something to be reported.
 
     Attributes:
-        key: names the event: it is told once.
+        key: names the event, which is reported once.
         kind: one of `settings.KINDS`.
         since: when it happened; local time.
     """
@@ -53,7 +53,7 @@ class Event:
 def events(
     store: Store, state: StoreStatus, settings: AlertSettings, now: datetime
 ) -> Iterator[Event]:
-    """Yield all that holds now or is on record, each with the key by which it is told once."""
+    """Yield all that holds now or is on record, each with the key by which it is reported once."""
     for found in _events(store, state, settings, now):
         if found.kind in settings.about:
             yield found
@@ -110,10 +110,11 @@ def _campaign(
 ) -> Iterator[Event]:
     name = f"{item.campaign} (simulated)" if item.simulated else item.campaign
     for drift in item.drift:
-        if not abs(drift.percent) < settings.drift_share * drift.bound_percent:
+        if drift.reaches(settings.drift_share):
+            change = "not known" if drift.percent is None else f"{drift.percent:+.1f} %"
             text = (
-                f"{name}: {drift.key} of the reference trial {drift.trial} drifted by "
-                f"{drift.percent:+.1f} %; {drift.bound_percent:g} % end the campaign"
+                f"{name}: drift of {drift.key} at the reference trial {drift.trial}: {change}; "
+                f"{drift.bound_percent:g} % end the campaign"
             )
             key = f"drift {item.campaign} {drift.trial} {drift.key}"
             yield Event(key, "drift", text, now)

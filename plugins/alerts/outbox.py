@@ -1,9 +1,9 @@
 """Messages on their way, as files of the store: none is lost when a receiver or we are down.
 
-    STORE/alerts/began.json      when alerts began: what is older is not told
+    STORE/alerts/began.json      when alerts began: what is older is not sent
     STORE/alerts/KEY.json        an event, to whom it goes, and when each took it
 
-An event is written before it is sent, under a name made of its key: it is told once, however often
+An event is written before it is sent, under a name made of its key: it is sent once, however often
 it is found. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
 the others are not affected.
 """

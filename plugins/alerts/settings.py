@@ -61,7 +61,7 @@ class AlertSettings(StrictModel):
 
     to: list[str] = Field(min_length=1)
     """Addresses of Apprise, such as ``mailto://user:password@example.org``. ``${NAME}`` is replaced
-    by a variable of the environment, so that no password stands in the file."""
+    by a variable of the environment, so that the file has no password."""
     timezone: Zone = "UTC"
     """Of `quiet` and `summary`."""
     about: list[Kind] = Field(default=list(KINDS))

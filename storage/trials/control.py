@@ -26,7 +26,6 @@ from sliplab.storage.trials.store import AGAIN, CAUSE, FORGIVEN, Campaign, Store
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]
 FOLDER, SKIPPED = "control", "skipped.json"
-_MOST_TRIES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,16 +64,9 @@ def ask(
     Raises:
         OSError: it cannot be written.
     """
-    journal = _journal(store)
-    number = max(journal.numbers(), default=0)
-    for _ in range(_MOST_TRIES):
-        number += 1
-        made = ControlRequest(
-            number=number, kind=kind, campaign=campaign, trials=trials, **signature(who, why)
-        )
-        if journal.add(number, {k: value for k, value in vars(made).items() if k != "number"}):
-            return made
-    raise OSError(f"{journal.folder}: no free number")
+    content: Json = {"kind": kind, "campaign": campaign, "trials": trials, **signature(who, why)}
+    number = _journal(store).append(content)
+    return ControlRequest(number=number, **content)
 
 
 def requests(store: Store) -> list[ControlRequest]:

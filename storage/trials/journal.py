@@ -16,6 +16,7 @@ from sliplab.storage.process import now, user_name
 from sliplab.storage.streams import Json
 
 _FILE = re.compile(r"(\d{6,12})\.json")
+_MOST_TRIES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,19 @@ class Journal:
             return []
         found = (_FILE.fullmatch(path.name) for path in self.folder.iterdir())
         return sorted(int(match[1]) for match in found if match)
+
+    def append(self, data: Json) -> int:
+        """Write the next entry, and return its number; two writers at once get two numbers.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        number = max(self.numbers(), default=0)
+        for _ in range(_MOST_TRIES):
+            number += 1
+            if self.add(number, data):
+                return number
+        raise OSError(f"{self.folder}: no free number")
 
     def add(self, number: int, data: Json) -> bool:
         """Write an entry, complete and flushed; False if its number is taken.

@@ -11,12 +11,13 @@ import pytest
 
 from sliplab.analysis.references import ReferenceDrift
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.status import StatusReader, as_json, night_of, nights_needed, pace_of
+from sliplab.flows.status import StatusReader, night_of, nights_needed, pace_of
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Campaign, Store
+from tests.command_line import answer
 from tests.flows.collecting.test_session import session, short
 from tests.flows.collecting.test_watches import with_references
 
@@ -57,9 +58,11 @@ def test_a_store_says_what_is_done_left_excluded_and_by_whom_it_is_held(tmp_path
     assert item.nights_of_disk == pytest.approx(found.disk_free / (2 * item.bytes_per_trial))
     control.skip(campaign, trials[2:], {"who": "ben", "when": "now", "why": "the tip was worn"})
     reader = StatusReader(store)
-    (item,) = as_json(reader.read(EVENING))["campaigns"]
-    assert (item["missing"], item["nights_left"], item["seconds_left"]) == (0, None, None)
-    assert [(out["trial"], out["by"]) for out in item["excluded"]] == [(trials[2], "ben")]
+    (item,) = reader.read(EVENING).campaigns
+    assert (item.missing, item.nights_left, item.seconds_left) == (0, None, None)
+    assert [(out["trial"], out["by"]) for out in item.excluded] == [(trials[2], "ben")]
+    (shown,) = answer("status", store.folder)["campaigns"]
+    assert (shown["missing"], shown["excluded"][0]["by"]) == (0, "ben")
     assert reader.read(EVENING).running is None
 
 
@@ -85,6 +88,12 @@ def test_the_drift_of_the_last_reference_trial_is_reported(
     (drift,) = item.drift
     assert (drift.key, drift.trial, drift.bound_percent) == ("event_rate", references[-1], 20)
     assert drift.percent == pytest.approx(10)
+    assert not drift.reaches()
+    rates[references[-1]] = float("nan")
+    (item,) = StatusReader(Store.open(tmp_path / "store")).read(EVENING).campaigns
+    assert item.drift[0].percent is None
+    assert item.drift[0].reaches()
+    assert answer("status", tmp_path / "store")["campaigns"][0]["drift"][0]["percent"] is None
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     assert set(texts) == set(KINDS)
     assert texts["run failed"] == "nightly failed: the arm did not answer"
     assert "pause by anna" in texts["paused"]
-    assert texts["drift"].startswith("tiny (simulated): event_rate of the reference trial r2")
+    assert "event_rate at the reference trial r2: -17.0 %" in texts["drift"]
     assert "no trial for 120 min" in texts["idle"]
     assert "from digital input to host time with trial t1" in texts["clock grade"]
     assert "b failed 2 times" in texts["trial set aside"]
@@ -141,8 +141,8 @@ def test_a_wait_that_is_expected_is_not_idle(
     assert "idle" not in {item.kind for item in found(store, at, **changes)}
 
 
-def test_a_drift_that_is_no_number_is_told(tmp_path: Path) -> None:
-    lost = replace(RUNNING, drift=[Drift("friction", float("nan"), 10.0, "r2")])
+def test_a_drift_that_is_not_known_is_reported(tmp_path: Path) -> None:
+    lost = replace(RUNNING, drift=[Drift("friction", None, 10.0, "r2")])
     kinds = {item.kind for item in found(Store.create(tmp_path / "s"), state(campaigns=[lost]))}
     assert "drift" in kinds
 
