@@ -62,7 +62,7 @@ class NightsLeft:
 
 
 @dataclass(frozen=True)
-class Drift:
+class DriftStatus:
     """Change of a figure of the reference trials since the first one.
 
     Attributes:
@@ -111,7 +111,7 @@ class CampaignStatus:
     nights_left: NightsLeft | None = None
     bytes_per_trial: int | None = None
     nights_of_disk: float | None = None
-    drift: list[Drift] = field(default_factory=list)
+    drift: list[DriftStatus] = field(default_factory=list)
     problem: str | None = None
 
 
@@ -152,7 +152,7 @@ class StatusReader:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._known: dict[tuple[Path, int], _TrialFolder] = {}
-        self._drift: dict[tuple[str, ...], list[Drift]] = {}
+        self._drift: dict[tuple[str, ...], list[DriftStatus]] = {}
         self._plans: dict[tuple[Path, int], Plan] = {}
 
     def read(self, now: datetime | None = None) -> StoreStatus:
@@ -249,12 +249,12 @@ class StatusReader:
                 found[path.name] = self._known[key]
         return found
 
-    def _drifts(self, plan: Plan, campaign: Campaign, committed: set[str]) -> list[Drift]:
+    def _drifts(self, plan: Plan, campaign: Campaign, committed: set[str]) -> list[DriftStatus]:
         known = [t.id for t in plan if t.role == "reference" and t.id in committed]
         key = (campaign.name, *known[:1], *known[-1:])
         if key not in self._drift:
             self._drift[key] = [
-                Drift(
+                DriftStatus(
                     item.key,
                     item.percent if math.isfinite(item.percent) else None,
                     item.bound_percent,

@@ -10,7 +10,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import (
     DAMAGED,
-    Problem,
+    StoreProblem,
     failed_gates,
     quarantine_damaged,
     salvaged,
@@ -35,7 +35,7 @@ class Verification(TypedDict):
     whole: int
     damaged: int
     ok: bool
-    problems: list[Problem]
+    problems: list[StoreProblem]
     url: NotRequired[str]
     format: NotRequired[int]
     quarantined: NotRequired[list[str]]
@@ -115,6 +115,6 @@ def _verify_pushed(url: str, quarantine: bool) -> Verification:
     }
 
 
-def _damaged(problems: list[Problem]) -> int:
+def _damaged(problems: list[StoreProblem]) -> int:
     """Return how many committed trials have a problem."""
     return len({(item.campaign, item.trial) for item in problems if item.trial})

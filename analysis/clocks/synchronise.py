@@ -60,7 +60,7 @@ _NONE: I64 = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
-class StreamClock:
+class ClockInput:
     """Raw clock data of a device with a stream, ns; empty where there are none.
 
     Attributes:
@@ -105,7 +105,7 @@ class SyncStreams:
     box_reads: ClockReads
     frame_camera_reads: ClockReads
     mid_exposure_ns: int | None
-    named: dict[str, StreamClock] = field(default_factory=dict)
+    named: dict[str, ClockInput] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -187,14 +187,14 @@ class TrialSync:
 
 def stream_clocks(
     about: Mapping[str, StreamRecord], opened: Callable[[str | None], StreamReader]
-) -> dict[str, StreamClock]:
+) -> dict[str, ClockInput]:
     """Read the clock data of the named streams, but for those that `timing.rig` times.
 
     Args:
         about: what the record says of the streams.
         opened: opens the file of a further camera by its name; the trial's own for None.
     """
-    found: dict[str, StreamClock] = {}
+    found: dict[str, ClockInput] = {}
     for name, stream in about.items():
         if stream.timing is not None:
             with opened(name if stream.of_camera else None) as reader:
@@ -202,15 +202,15 @@ def stream_clocks(
     return found
 
 
-def _stream_clock(name: str, about: StreamRecord, reader: StreamReader) -> StreamClock:
+def _stream_clock(name: str, about: StreamRecord, reader: StreamReader) -> ClockInput:
     if not about.of_camera:
-        return StreamClock(about.timing, samples=_samples(name, reader))
+        return ClockInput(about.timing, samples=_samples(name, reader))
     mid_ns = about.mid_exposure_ns or 0
     if about.kind == EVENTS_KIND:
-        return StreamClock(about.timing, reader.pulses("event_pulses"))
+        return ClockInput(about.timing, reader.pulses("event_pulses"))
     lit = reader.column("frames/sync") > 0
     begins = reader.column("frames/t")[lit] - mid_ns
-    return StreamClock(about.timing, begins, reader.clock_reads("frame_camera_reads"), mid_ns)
+    return ClockInput(about.timing, begins, reader.clock_reads("frame_camera_reads"), mid_ns)
 
 
 def _samples(name: str, reader: StreamReader) -> tuple[I64, I64]:
@@ -221,7 +221,7 @@ def _samples(name: str, reader: StreamReader) -> tuple[I64, I64]:
     return reader.column(own), reader.column(host)
 
 
-def clocks_in(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, StreamClock]:
+def clocks_in(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, ClockInput]:
     """Read the clock data of the named streams of a sealed trial; see `stream_clocks`."""
     return stream_clocks(
         about, lambda name: StreamReader(folder / (DATA if name is None else stream_file(name)))
@@ -231,7 +231,7 @@ def clocks_in(folder: Path, about: Mapping[str, StreamRecord]) -> dict[str, Stre
 def streams_of(
     reader: StreamReader,
     mid_exposure_ns: int | None,
-    named: Mapping[str, StreamClock] | None = None,
+    named: Mapping[str, ClockInput] | None = None,
 ) -> SyncStreams:
     """Read the clock data of a trial's file.
 
@@ -244,7 +244,7 @@ def streams_of(
 
     named = named or {}
     first = {
-        name: StreamClock(None, samples=_samples(name, reader))
+        name: ClockInput(None, samples=_samples(name, reader))
         for name, kind in reader.streams().items()
         if kind == WRENCH.name and name not in named
     }
@@ -294,7 +294,7 @@ def synchronise(
     pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
     if with_events:
         how = _timing(timing.event_camera, "trigger input")
-        camera = StreamClock(how, streams.event_pulses)
+        camera = ClockInput(how, streams.event_pulses)
         _try(found, "events", partial(_stream, pulses, "events", camera, streams))
     if timing.arm == "digital input":
         stamps, arm = streams.arm_pulses, timing.arm_controller
@@ -307,7 +307,7 @@ def synchronise(
             _try(found, "frames", lambda: _by_exposures(begins, streams, timing))
         else:
             how = _timing(timing.frame_camera, timing.frames)
-            camera = StreamClock(
+            camera = ClockInput(
                 how.model_copy(update={"delay": timing.frame_delay}),
                 begins[streams.frame_sync > 0],
                 streams.frame_camera_reads,
@@ -324,7 +324,7 @@ def _timing(clock: DeviceClock, grade: StreamGrade) -> StreamTiming:
     return StreamTiming(**clock.model_dump(), grade=grade)
 
 
-def _stream(pulses: _Pulses, name: str, device: StreamClock, streams: SyncStreams) -> DeviceSync:
+def _stream(pulses: _Pulses, name: str, device: ClockInput, streams: SyncStreams) -> DeviceSync:
     """Fit the clock of a device with a stream by the means of its grade."""
     timing = pulses.timing
     how = device.timing or timing.force or ForceTiming()

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.detectors import (
+    DetectionRule,
     Learned,
     Levels,
-    Rule,
     Smoothing,
     TrialWithSlip,
     Tuned,
@@ -62,7 +62,7 @@ class TrialEvidence:
     references: References = field(default_factory=dict)
 
 
-def judge(detector: Rule, trials: Sequence[TrialWithSlip]) -> list[TrialEvidence]:
+def judge(detector: DetectionRule, trials: Sequence[TrialWithSlip]) -> list[TrialEvidence]:
     """Evidence of a detector on labelled trials."""
     return [TrialEvidence(detector.evidence(t.predictions), t.slip, t.references) for t in trials]
 
@@ -230,7 +230,7 @@ def _quickest(
 
 def _detectors(
     learned: Learned, windows: Windows, settings: Detection, stride_ms: int
-) -> dict[str, dict[int, Rule]]:
+) -> dict[str, dict[int, DetectionRule]]:
     """Detectors by name; where there are several, the validation trials choose, by the number."""
     ours = learned.detectors(stride_ms / windows.length_ms)
     return {

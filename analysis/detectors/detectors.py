@@ -400,7 +400,7 @@ class WindowEvidence:
     no_slip: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
-class Rule(ABC):
+class DetectionRule(ABC):
     """Evidence that slip has begun.
 
     A rule stores nothing: `push` takes its state after the last window and returns the next one.
@@ -430,7 +430,7 @@ class Rule(ABC):
 
 
 @dataclass(frozen=True)
-class Smoothing(Rule):
+class Smoothing(DetectionRule):
     """The paper's rule: mean counts of the last `width` windows, and by how much a class leads.
 
     The evidence is the lead over every other class in spikes, negative where the class trails, and
@@ -441,15 +441,15 @@ class Smoothing(Rule):
 
     @property
     def span(self) -> int:
-        """See `Rule`."""
+        """See `DetectionRule`."""
         return self.width
 
     def begin(self) -> IntArray:
-        """See `Rule`; the counts of the last ``width - 1`` windows."""
+        """See `DetectionRule`; the counts of the last ``width - 1`` windows."""
         return np.empty((0, len(CLASSES)), np.int64)
 
     def push(self, state: IntArray, windows: Predictions) -> tuple[IntArray, WindowEvidence]:
-        """See `Rule`."""
+        """See `DetectionRule`."""
         every = np.concatenate([state, windows.counts])
         sums = np.zeros((len(every) + 1, len(CLASSES)), np.int64)
         sums[1:] = every.cumsum(axis=0)
@@ -491,18 +491,18 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Filter(Rule):
+class Filter(DetectionRule):
     """The hidden Markov filter; the evidence is log odds."""
 
     chain: StateChain
     reading: Reading
 
     def begin(self) -> FloatArray:
-        """See `Rule`; the log probabilities of the states, float64 (states,)."""
+        """See `DetectionRule`; the log probabilities of the states, float64 (states,)."""
         return _first_state(self.chain)
 
     def push(self, state: FloatArray, windows: Predictions) -> tuple[FloatArray, WindowEvidence]:
-        """See `Rule`."""
+        """See `DetectionRule`."""
         beliefs = _advanced(self.chain, state.copy(), self.reading.log(windows))
         gross = log_odds(beliefs, GROSS)
         found = WindowEvidence(
@@ -512,19 +512,19 @@ class Filter(Rule):
 
 
 @dataclass(frozen=True)
-class Cusum(Rule):
+class Cusum(DetectionRule):
     """Page's test of no slip against incipient slip; after that, of incipient against gross."""
 
     reading: Reading
 
     def begin(self) -> tuple[float, float]:
-        """See `Rule`; the statistics of both tests."""
+        """See `DetectionRule`; the statistics of both tests."""
         return 0.0, 0.0
 
     def push(
         self, state: tuple[float, float], windows: Predictions
     ) -> tuple[tuple[float, float], WindowEvidence]:
-        """See `Rule`."""
+        """See `DetectionRule`."""
         log = self.reading.log(windows)
         slip = cusum(log[:, INCIPIENT] - log[:, NO_SLIP], state[0])
         ratio = log[:, GROSS] - log[:, INCIPIENT]
@@ -540,7 +540,7 @@ class Cusum(Rule):
         return (float(slip[-1]), float(gross_after(-1)[-1])), found
 
     def detected(self, state: tuple[float, float]) -> tuple[float, float]:
-        """See `Rule`; the second test begins."""
+        """See `DetectionRule`; the second test begins."""
         return state[0], 0.0
 
 
@@ -557,7 +557,7 @@ class Tuned:
     """A rule with its levels, such as validation trials set."""
 
     name: str
-    detector: Rule
+    detector: DetectionRule
     levels: Levels
 
     def classes(self, evidence: WindowEvidence, gross_found: bool) -> npt.NDArray[np.int8]:
@@ -613,7 +613,7 @@ class Learned:
     chain: StateChain
     readings: dict[str, Reading]
 
-    def detectors(self, stride_share: float) -> dict[str, Rule]:
+    def detectors(self, stride_share: float) -> dict[str, DetectionRule]:
         """A filter and a test for each reading, by name.
 
         Args:

@@ -34,7 +34,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.trial_work import KeepTrials
 from sliplab.analysis.windows.dataset import TrialId
-from sliplab.analysis.windows.window_table import TrialWindows, trial_windows
+from sliplab.analysis.windows.window_table import LabelledWindows, trial_windows
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.later import need
@@ -204,7 +204,7 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
     return kind, result
 
 
-def _outputs(table: pd.DataFrame, known: list[TrialWindows], where: str) -> dict[TrialId, I64]:
+def _outputs(table: pd.DataFrame, known: list[LabelledWindows], where: str) -> dict[TrialId, I64]:
     """Return the outputs (n, 3) of each trial's windows, in the order of time.
 
     Raises:

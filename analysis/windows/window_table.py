@@ -23,7 +23,7 @@ I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class TrialWindows:
+class LabelledWindows:
     """The windows of one trial.
 
     Attributes:
@@ -68,7 +68,7 @@ class TrialWindows:
 
 def trial_windows(
     labels: StoreLabels, campaigns: list[Collected], split: str
-) -> Iterator[TrialWindows]:
+) -> Iterator[LabelledWindows]:
     """Yield the windows of each labelled trial of a part of the split.
 
     Raises:
@@ -88,7 +88,7 @@ def trial_windows(
                     raise StoreError(text)
                 label, seed = labels.read(item, recording), hash_integer("samples", trial.id)
                 samples = sample_starts(recording, label, settings.windows, settings.samples, seed)
-            yield TrialWindows(
+            yield LabelledWindows(
                 TrialId(item.name, trial.id),
                 split,
                 recording,

@@ -15,7 +15,7 @@ import typer
 
 from sliplab.flows.cli.common import COLLECT, JsonOption, RigOption, StoreArgument, StoreOption
 from sliplab.flows.cli.model_options import model_options
-from sliplab.flows.planning.parameters import Ask, Requester
+from sliplab.flows.planning.parameters import ControlOptions, Requester
 from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
 from sliplab.protocols.plugin import plugins
@@ -45,7 +45,7 @@ CampaignOption = Annotated[
 @model_options
 def pause(
     store: StoreArgument,
-    wanted: Ask,
+    wanted: ControlOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Pause after the current trial; returns once the collection is paused."""
@@ -57,7 +57,7 @@ def pause(
 @model_options
 def resume(
     store: StoreArgument,
-    wanted: Ask = Ask(wait_s=60.0),
+    wanted: ControlOptions = ControlOptions(wait_s=60.0),
     as_json: JsonOption = False,
 ) -> None:
     """Resume a paused collection."""
@@ -71,7 +71,7 @@ def resume(
 @model_options
 def stop(
     store: StoreArgument,
-    wanted: Ask = Ask(wait_s=60.0),
+    wanted: ControlOptions = ControlOptions(wait_s=60.0),
     as_json: JsonOption = False,
 ) -> None:
     """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
@@ -121,7 +121,7 @@ def again(
     _decide(store, "again", trials, campaign, why, requester, as_json)
 
 
-def _request(store: Path, kind: Kind, wanted: Ask) -> RequestOutcome:
+def _request(store: Path, kind: Kind, wanted: ControlOptions) -> RequestOutcome:
     from sliplab.flows.collecting import requests
     from sliplab.storage.trials.store import Store
 

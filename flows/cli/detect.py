@@ -9,7 +9,7 @@ import typer
 
 from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, RigOption
 from sliplab.flows.cli.model_options import model_options
-from sliplab.flows.planning.parameters import Rule
+from sliplab.flows.planning.parameters import RuleOptions
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 
@@ -75,7 +75,7 @@ def detect(
             help="Time between windows, ms; default: the window length.",
         ),
     ] = None,
-    rule: Rule = Rule(),
+    rule: RuleOptions = RuleOptions(),
     poll: Annotated[
         float, typer.Option("--poll", min=1, max=200, help="Polling period of the streams, ms.")
     ] = 5.0,
@@ -113,7 +113,7 @@ def detect(
         raise typer.Exit(exit_codes.INTERRUPTED)
 
 
-def _chosen(model: Path, detector: str, stride: float | None, rule: Rule) -> Chosen:
+def _chosen(model: Path, detector: str, stride: float | None, rule: RuleOptions) -> Chosen:
     """Return a detector of a store, or a network with the rule.
 
     Raises:

@@ -18,7 +18,7 @@ from sliplab.flows.cli.common import (
     step,
 )
 from sliplab.flows.cli.model_options import model_options
-from sliplab.flows.planning.parameters import Rule
+from sliplab.flows.planning.parameters import RuleOptions
 from sliplab.flows.running import console
 from sliplab.flows.steps import located, run_step
 from sliplab.protocols.shown import plural
@@ -94,7 +94,7 @@ def train(
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
-    rule: Rule = Rule(),
+    rule: RuleOptions = RuleOptions(),
     reviewed: ReviewedOption = False,
     baselines: Annotated[
         bool,

@@ -61,7 +61,7 @@ class CollectOptions(SessionMetadata, TrialChoice):
         }
 
 
-class Rule(StrictModel):
+class RuleOptions(StrictModel):
     """The rule that decides on slip; of the model or the protocol by default."""
 
     margin: float | None = Field(
@@ -94,5 +94,5 @@ class Requester(StrictModel):
         return {"limit_s": self.wait_s, **self.model_dump(exclude={"wait_s"})}
 
 
-class Ask(Requester, Reason):
+class ControlOptions(Requester, Reason):
     """Parameters of a request to the current collection."""

@@ -25,7 +25,7 @@ from zoneinfo import ZoneInfo, available_timezones
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from sliplab.flows.planning import parameters
-from sliplab.flows.planning.parameters import CollectOptions, Rule, SessionMetadata
+from sliplab.flows.planning.parameters import CollectOptions, RuleOptions, SessionMetadata
 from sliplab.protocols import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean, one_of
@@ -165,11 +165,11 @@ class ScheduledStep(StrictModel):
     campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
-class Evaluate(Rule, ScheduledStep):
+class Evaluate(RuleOptions, ScheduledStep):
     """Parameters of evaluating the network on the test trials."""
 
 
-class Ask(parameters.Ask):
+class Ask(parameters.ControlOptions):
     """Parameters of a request from Prefect's page to the current collection."""
 
     who: str = Field(default="", description="Your name; default: Prefect's page.")

@@ -17,7 +17,7 @@ from sliplab.storage.remote.manifest import (
 from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError, RemoteMissing
 from sliplab.storage.trials.checksums import CHECKSUMS
 from sliplab.storage.trials.store import StoreError
-from sliplab.storage.trials.verify import Problem
+from sliplab.storage.trials.verify import StoreProblem
 
 KINDS: tuple[Kind, ...] = ("about", "trials", "quarantine", "withdrawn")
 
@@ -26,7 +26,7 @@ def verify_remote(
     remote: Remote,
     on_trial: Callable[[str], None] | None = None,
     on_bytes: OnBytes | None = None,
-) -> tuple[int, list[Problem]]:
+) -> tuple[int, list[StoreProblem]]:
     """Hold every visible file against its checksum.
 
     Returns:
@@ -42,7 +42,7 @@ def verify_remote(
         try:
             safe_name(name)
         except StoreError as error:
-            problems.append(Problem(f"{remote.url}/campaigns", str(error)))
+            problems.append(StoreProblem(f"{remote.url}/campaigns", str(error)))
             continue
         sizes = remote.sizes(objects_folder(name))
         known: dict[str, bool] = {}
@@ -50,16 +50,18 @@ def verify_remote(
         lost = listing_problem(remote, name, listed["about"].get(""), listed["trials"])
         if lost is not None:
             unlisted = lost
-            problems.append(Problem(f"{remote.url}/campaigns/{name}", lost, campaign=name))
+            problems.append(StoreProblem(f"{remote.url}/campaigns/{name}", lost, campaign=name))
         for kind in KINDS:
             for item, found in listed[kind].items():
                 trial = item if kind == "trials" else ""
                 trials += bool(trial)
                 if isinstance(found, RemoteError):
-                    problems.append(Problem(remote.url, str(found), campaign=name, trial=trial))
+                    problems.append(
+                        StoreProblem(remote.url, str(found), campaign=name, trial=trial)
+                    )
                 else:
                     problems += [
-                        Problem(remote.where(key), what, campaign=name, trial=trial)
+                        StoreProblem(remote.where(key), what, campaign=name, trial=trial)
                         for key, what in _problems(remote, found, sizes, known, on_bytes)
                     ]
                 if trial and on_trial is not None:

@@ -60,7 +60,7 @@ DAMAGED, UNFINISHED, RECORDING = "damaged", "unfinished", "recording"
 
 
 @dataclass(frozen=True)
-class Problem:
+class StoreProblem:
     """One thing that is wrong, or not finished.
 
     Attributes:
@@ -84,7 +84,7 @@ def verify(
     store: Store,
     on_trial: Callable[[str], None] | None = None,
     on_mended: Callable[[Path], None] | None = None,
-) -> list[Problem]:
+) -> list[StoreProblem]:
     """Check every trial of every campaign; all is well where no problem is ``damaged``.
 
     A collection may run meanwhile.
@@ -101,7 +101,7 @@ def verify(
     folder = store.folder / "campaigns"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         if path.is_symlink() or not path.is_dir():
-            problems.append(Problem(str(path), "is not a campaign folder"))
+            problems.append(StoreProblem(str(path), "is not a campaign folder"))
         else:
             problems += _campaign(store, Campaign(path), on_trial, on_mended)
     return problems
@@ -112,7 +112,7 @@ def _campaign(
     campaign: Campaign,
     on_trial: Callable[[str], None] | None,
     on_mended: Callable[[Path], None] | None,
-) -> list[Problem]:
+) -> list[StoreProblem]:
     problems = _description(store, campaign)
     if problems and current_holder(store.folder / STORE_LOCK) is not None:
         problems = _description(store, campaign)  # it may have been written meanwhile
@@ -170,15 +170,15 @@ def failed_gates(store: Store) -> dict[str, list[str]]:
     return found
 
 
-def verify_trial(folder: Path) -> list[Problem]:
+def verify_trial(folder: Path) -> list[StoreProblem]:
     """Check checksums, sizes, counts and clocks of one committed trial."""
     name, found = folder.parent.parent.name, _trial(folder)
     if not os.path.lexists(folder):
         return []  # a running program moved it to quarantine meanwhile
     if known_cause(folder) is not None:
         what = "is to be moved to quarantine; the next `sliplab collect` does it"
-        return [Problem(str(folder), what, UNFINISHED, name)]
-    return [Problem(str(path), what, DAMAGED, name, folder.name) for path, what in found]
+        return [StoreProblem(str(folder), what, UNFINISHED, name)]
+    return [StoreProblem(str(path), what, DAMAGED, name, folder.name) for path, what in found]
 
 
 Found = list[tuple[Path, str]]
@@ -225,11 +225,11 @@ def _belongs(name: str, sums: Checksums) -> bool:
     return name in _KNOWN
 
 
-def _description(store: Store, campaign: Campaign) -> list[Problem]:
+def _description(store: Store, campaign: Campaign) -> list[StoreProblem]:
     """Check the campaign's own files."""
 
-    def problem(path: Path, what: str, kind: str = DAMAGED) -> Problem:
-        return Problem(str(path), what, kind, campaign.name)
+    def problem(path: Path, what: str, kind: str = DAMAGED) -> StoreProblem:
+        return StoreProblem(str(path), what, kind, campaign.name)
 
     folder, found = campaign.folder, []
     if not campaign.begun:
@@ -263,26 +263,26 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
             found.append(problem(path, f"{wrong}; `sliplab collect` writes it again"))
     found += _registered(campaign)
     return found + [
-        Problem(item.path, item.what, item.kind, campaign.name)
+        StoreProblem(item.path, item.what, item.kind, campaign.name)
         for place in (folder, folder / "bench")
         for item in _temporary(place, campaign.name)
     ]
 
 
-def _registered(campaign: Campaign) -> list[Problem]:
+def _registered(campaign: Campaign) -> list[StoreProblem]:
     """Check a campaign's registrations."""
     found = [
-        Problem(str(path), what, DAMAGED, campaign.name)
+        StoreProblem(str(path), what, DAMAGED, campaign.name)
         for path, what in registration_problems(campaign)
     ]
     return found + _temporary(campaign.folder / REGISTRATIONS, campaign.name)
 
 
-def _temporary(folder: Path, campaign: str) -> list[Problem]:
+def _temporary(folder: Path, campaign: str) -> list[StoreProblem]:
     """Find temporary files of ended programs."""
     what = "was left by a killed program; the next `sliplab collect` deletes it"
     return [
-        Problem(str(path), what, UNFINISHED, campaign)
+        StoreProblem(str(path), what, UNFINISHED, campaign)
         for path, runs in temporary_files(folder)
         if not runs
     ]
@@ -431,7 +431,7 @@ def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str
     return problems
 
 
-def _leftovers(store: Store, campaign: Campaign) -> list[Problem]:
+def _leftovers(store: Store, campaign: Campaign) -> list[StoreProblem]:
     """Find unfinished trials, and quarantined ones without a cause."""
     found = []
     folder = campaign.folder / "incoming"
@@ -449,18 +449,18 @@ def _leftovers(store: Store, campaign: Campaign) -> list[Problem]:
         else:
             what = "is an unfinished trial; the next `sliplab collect` quarantines it"
             kind = UNFINISHED
-        found.append(Problem(str(path), what, kind, campaign.name))
+        found.append(StoreProblem(str(path), what, kind, campaign.name))
     folder = campaign.folder / "quarantine"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         try:
             read_json(path / CAUSE)["cause"]
         except (OSError, ValueError, KeyError) as error:
             what = f"gives no cause: {error}"
-            found.append(Problem(str(path / CAUSE), what, DAMAGED, campaign.name))
+            found.append(StoreProblem(str(path / CAUSE), what, DAMAGED, campaign.name))
     return found
 
 
-def quarantine_damaged(store: Store, problems: list[Problem]) -> list[str]:
+def quarantine_damaged(store: Store, problems: list[StoreProblem]) -> list[str]:
     """Quarantine every committed trial that has a problem; the caller holds the store's lock.
 
     Returns:

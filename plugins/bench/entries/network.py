@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Predictions, Rule, TrialWithSlip, learn
+from sliplab.analysis.detectors.detectors import DetectionRule, Predictions, TrialWithSlip, learn
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import paper_level, paper_rule
 from sliplab.analysis.metrics.classification import winners
@@ -46,7 +46,7 @@ class Spiking(WindowDetector):
         super().__init__(settings.windows, stride_ms)
         self.settings, self._by_paper = settings, by_paper
         self._engine: SpikeEngine | None = None
-        self._rule: Rule = paper_rule(settings.detection).detector
+        self._rule: DetectionRule = paper_rule(settings.detection).detector
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         """See `Detector`."""

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Predictions, Rule, first_above
+from sliplab.analysis.detectors.detectors import DetectionRule, Predictions, first_above
 from sliplab.analysis.detectors.latency import TrueSlip, median_with_lost
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.intervals import exact_interval
@@ -56,7 +56,9 @@ class TrialDetection:
     detected_ns: int | None
 
 
-def alarms(detector: Rule, level: float, predictions: Predictions) -> npt.NDArray[np.int64]:
+def alarms(
+    detector: DetectionRule, level: float, predictions: Predictions
+) -> npt.NDArray[np.int64]:
     """Times of all alarms, the ends of their windows, ns, (n,)."""
     found, start = [], 0
     end_ns = predictions.end_ns

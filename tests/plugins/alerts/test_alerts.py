@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from sliplab.flows.running import run_records
-from sliplab.flows.status import CampaignStatus, Drift, NightsLeft, StoreStatus
+from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
 from sliplab.plugins.alerts.conditions import Event, events
 from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
@@ -91,7 +91,7 @@ RUNNING = CampaignStatus(
     bytes_per_trial=10**9,
     nights_of_disk=1.0,
     nights_left=NightsLeft(2, None, None, "2030-03-03", "2030-03-03"),
-    drift=[Drift("event_rate", -17.0, 20.0, "r2")],
+    drift=[DriftStatus("event_rate", -17.0, 20.0, "r2")],
 )
 
 
@@ -142,7 +142,7 @@ def test_a_wait_that_is_expected_is_not_idle(
 
 
 def test_a_drift_that_is_not_known_is_reported(tmp_path: Path) -> None:
-    lost = replace(RUNNING, drift=[Drift("friction", None, 10.0, "r2")])
+    lost = replace(RUNNING, drift=[DriftStatus("friction", None, 10.0, "r2")])
     kinds = {item.kind for item in found(Store.create(tmp_path / "s"), state(campaigns=[lost]))}
     assert "drift" in kinds
 
