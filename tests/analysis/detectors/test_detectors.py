@@ -41,7 +41,7 @@ def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> 
 
 LEARNED = detectors.learn([trial(seed) for seed in range(8)], LENGTH, 30)
 FINE = LEARNED.detectors(1 / 3)
-DETECTORS: dict[str, detectors.Rule] = {
+DETECTORS: dict[str, detectors.DetectionRule] = {
     "smoothing": Smoothing(4),
     **LEARNED.detectors(1.0),
     "fine": FINE["hmm counts"],

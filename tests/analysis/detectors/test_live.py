@@ -14,9 +14,9 @@ from sliplab.analysis.detectors import detectors
 from sliplab.analysis.detectors import live as lives
 from sliplab.analysis.detectors.detectors import (
     Cusum,
+    DetectionRule,
     Levels,
     Predictions,
-    Rule,
     StateChain,
     Tuned,
 )
@@ -155,7 +155,7 @@ def test_the_rule_step_by_step_is_the_rule(
     st.floats(0.0, 6.0),
 )
 def test_a_detector_step_by_step_decides_as_on_the_whole(
-    rows: list[tuple[int, ...]], detector: Rule, level: float
+    rows: list[tuple[int, ...]], detector: DetectionRule, level: float
 ) -> None:
     counts = np.array(rows, np.int64).reshape(-1, 3)
     seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))
