@@ -118,9 +118,11 @@ def _runs(store: Store) -> Iterator[LogEntry]:
         if ended is None:
             text = f"{name}: no end is known"
         else:
+            stopped = run_records.was_stopped(ended)
+            state = "stopped by a person" if stopped else str(ended["state"]).lower()
             took = datetime.fromisoformat(ended["when"]) - datetime.fromisoformat(run["began"])
-            text = f"{name}: {str(ended['state']).lower()} after {duration(took.total_seconds())}"
-            text += f": {ended['message']}" if ended.get("message") else ""
+            text = f"{name}: {state} after {duration(took.total_seconds())}"
+            text += f": {ended['message']}" if ended.get("message") and not stopped else ""
         yield LogEntry(
             when=_to_second(run["began"]),
             who=str(run.get("process", {}).get("user", "")),

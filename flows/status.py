@@ -1,8 +1,8 @@
 """The state of a store: who collects, how far each campaign is, when it ends, what needs a person.
 
 Nights are counted from noon to noon, local time, by the end of each committed trial. How many more
-are needed follows from the trials of the nights so far; the current night is left out while there
-are others, as it is not over.
+are needed follows from the trials of the nights so far; the current night is left out, as it
+is not over.
 """
 
 from __future__ import annotations
@@ -203,12 +203,12 @@ class StatusReader:
             by_night = Counter(night_of(moment) for moment in ended.values())
             tonight = by_night.get(night_of(now), 0)
             nights = [by_night[night] for night in sorted(by_night)]
-            over = nights[:-1] if tonight and len(nights) > 1 else nights
+            over = nights[:-1] if tonight else nights
             sizes = [folders[trial.id].bytes for trial in done[-LOOK_BACK:]]
             size = round(median(sizes)) if sizes else None
             pace = pace_of(plan, ended)
             left = sum(plan.seconds(trial) for trial in missing)
-            a_night = mean(over) if over else 0.0
+            a_night = mean(over or nights) if nights else 0.0
             return CampaignStatus(
                 campaign=campaign.name,
                 simulated=simulated,

@@ -121,6 +121,11 @@ def runs(store: Path) -> list[tuple[Json, Json | None]]:
     return found
 
 
+def was_stopped(ended: Json) -> bool:
+    """Return whether a run ended because a person stopped it, which Prefect calls a crash."""
+    return str(ended.get("message", "")).startswith("KeyboardInterrupt")
+
+
 def open_runs(store: Path) -> list[Json]:
     """Return the runs that began and did not end, as far as the store knows."""
     return [run for run, ended in runs(store) if ended is None]

@@ -76,7 +76,9 @@ def _events(
 
 def _failed_runs(store: Store) -> Iterator[Event]:
     for run, ended in run_records.runs(store.folder):
-        if ended is not None and ended.get("state") in FAILED:
+        if ended is None or run_records.was_stopped(ended):
+            continue
+        if ended.get("state") in FAILED:
             name = run.get("deployment") or run["flow"]
             text = f"{name} {str(ended['state']).lower()}: {ended.get('message') or 'no message'}"
             since = datetime.fromisoformat(ended["when"])

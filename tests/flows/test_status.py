@@ -56,6 +56,8 @@ def test_a_store_says_what_is_done_left_excluded_and_by_whom_it_is_held(tmp_path
     assert item.nights_left.last == "2026-03-02"
     assert item.bytes_per_trial is not None
     assert item.nights_of_disk == pytest.approx(found.disk_free / (2 * item.bytes_per_trial))
+    (item,) = reader.read(EVENING - timedelta(days=1)).campaigns
+    assert (item.tonight, item.nights_left) == (2, None)  # the only night is not over
     control.skip(campaign, trials[2:], {"who": "ben", "when": "now", "why": "the tip was worn"})
     reader = StatusReader(store)
     (item,) = reader.read(EVENING).campaigns

@@ -101,6 +101,9 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     run = str(uuid4())
     run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
     run_records.end(store.folder, run, "FAILED", "the arm did not answer", "flow")
+    by_hand = str(uuid4())
+    run_records.begin(store.folder, by_hand, "label", run_records.EMBEDDED)
+    run_records.end(store.folder, by_hand, "CRASHED", "KeyboardInterrupt: ", "flow")
     control.ask(store, "pause", who="anna", why="lunch")
     for attempt in (1, 2):
         fail(tiny, "b", attempt)
@@ -120,6 +123,8 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     assert "from digital input to host time with trial t1" in texts["clock grade"]
     assert "b failed 2 times" in texts["trial set aside"]
     assert texts["campaign done"] == "tiny (simulated): done, 4 of 4 trials"
+    failed = [item.text for item in found(store, at) if item.kind == "run failed"]
+    assert len(failed) == 1  # the one that a person stopped did not fail
     few = found(store, at, about=["disk"])
     assert [item.kind for item in few] == ["disk"]
 
