@@ -49,6 +49,8 @@ COLUMNS: dict[Kind, tuple[str, ...]] = {
     "spikes": tuple(f"{name}_spikes" for name in CLASSES),
 }
 """Columns by what they hold."""
+MOST_SPIKES = 1_000_000
+"""Spikes of a class in a window that a table may state."""
 _SCALE: dict[Kind, int] = {"class": 1, "probability": 1_000_000, "spikes": 1}
 _SHOWN = 3
 """Places that a message names of each fault."""
@@ -184,11 +186,14 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
         right = f"must be one of {', '.join(CLASSES)}"
     else:
         cells = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
-        good = np.isfinite(cells).all(axis=1) & (cells >= 0).all(axis=1)
+        most = 1 if kind == "probability" else MOST_SPIKES
+        good = ((cells >= 0) & (cells <= most)).all(axis=1)  # NaN is neither
         cells = np.where(good[:, None], cells, 0)
-        good &= (cells <= 1).all(axis=1) if kind == "probability" else (cells % 1 == 0).all(axis=1)
+        right = "must be from 0 to 1"
+        if kind == "spikes":
+            good &= (cells % 1 == 0).all(axis=1)
+            right = f"must be whole numbers from 0 to {MOST_SPIKES:,}"
         values = np.rint(cells * _SCALE[kind]).astype(np.int64)
-        right = "must be from 0 to 1" if kind == "probability" else "must be whole numbers from 0"
     whole = (start.notna() & (start % 1 == 0)).to_numpy()
     for key, fits, words in (
         ("start_ns", whole, "must be whole nanoseconds"),

@@ -45,6 +45,9 @@ def schema(
     if out is None:
         console.print_json(made)
         return
+    from sliplab.storage.trials.catalogue import refuse_store_file
+
+    refuse_store_file(out, "--out")
     make_folder(out.parent)
     write_json(out, made)
     finish({"kind": kind, "file": str(out)}, f"schema {kind}", as_json)

@@ -70,8 +70,9 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from sliplab.storage.trials.catalogue import write_table
+        from sliplab.storage.trials.catalogue import check_table_path, write_table
 
+        check_table_path(output)
         write_table(table, output)
         console.say(f"{plural(len(table), 'trial')}: {output}")
     if as_json:

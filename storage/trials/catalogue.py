@@ -34,7 +34,7 @@ from sliplab.storage.streams import I64
 from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.hdf5_writer import STREAMS
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import STORE, Campaign, Store, StoreError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -196,13 +196,29 @@ def check_table_path(path: Path) -> None:
     """Check that a table can be written to a path.
 
     Raises:
-        InputError: it ends in something else than .csv, .parquet or .json.
+        InputError: it ends in something else than .csv, .parquet or .json, or is a file of a store.
         ModuleNotFoundError: what writes Parquet is not installed.
     """
+    refuse_store_file(path, "--output")
     if path.suffix not in (".csv", ".parquet", ".json"):
         raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
     if path.suffix == ".parquet":
         need("pyarrow")
+
+
+def refuse_store_file(path: Path, option: str) -> None:
+    """Refuse an output that would replace a file of a store, or lie among its trials.
+
+    Raises:
+        InputError: it would.
+    """
+    there = path.resolve()
+    for store in there.parents:
+        if (store / STORE).is_file() and (
+            there.exists() or there.is_relative_to(store / "campaigns")
+        ):
+            text = f"belongs to the store {store}; give a path outside of it"
+            raise InputError(option, "", str(path), text)
 
 
 def _parquet(table: pd.DataFrame) -> bytes:

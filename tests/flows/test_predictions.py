@@ -107,9 +107,10 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
     ),
     "nan": (
         lambda t: t.assign(gross_spikes=t["gross_spikes"].where(t.index != 3)),
-        "must be whole numbers from 0; not so in 1 row: 3",
+        "must be whole numbers from 0 to 1,000,000; not so in 1 row: 3",
     ),
     "half": (lambda t: t.assign(gross_spikes=0.5), "must be whole numbers from 0"),
+    "too many": (lambda t: t.assign(gross_spikes=1e19), "from 0 to 1,000,000"),
     "time": (lambda t: t.assign(start_ns=None), "start_ns: must be whole nanoseconds"),
     "column": (lambda t: t.drop(columns=["trial"]), "trial: is missing"),
     "outputs": (lambda t: t.drop(columns=SPIKES), "must have the columns class or no_slip,"),

@@ -10,11 +10,13 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.trials import catalogue as module
-from sliplab.storage.trials.catalogue import catalogue, query, write_table
+from sliplab.storage.trials.catalogue import catalogue, check_table_path, query, write_table
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
+from tests.command_line import here
 from tests.storage.trial_files import IDENTITY, campaign, commit
 
 INDEX = Path("derived/catalogue/index")
@@ -219,3 +221,15 @@ def test_table_is_written_into_a_folder_that_is_missing(suffix: str, tmp_path: P
 def test_an_empty_store_has_an_empty_catalogue(tmp_path: Path) -> None:
     campaign(tmp_path / "s")
     assert len(catalogue(Store.open(tmp_path / "s"))) == 0
+
+
+def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
+    folder = Store.create(tmp_path / "s").folder
+    for name in ("store.json", "campaigns/new.csv", "campaigns/c/trials/a/trial.json"):
+        with pytest.raises(InputError, match="belongs to the store"):
+            check_table_path(folder / name)
+    check_table_path(folder / "mine.csv")
+    check_table_path(tmp_path / "mine.csv")
+    assert here("schema", "trial", "--out", folder / "store.json").returncode == 2
+    assert here("trials", folder, "--output", folder / "store.json").returncode == 2
+    Store.open(folder)
