@@ -181,8 +181,9 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
     Raises:
         InputError: it ends in something else than .csv, .parquet or .json.
+        ModuleNotFoundError: what writes Parquet is not installed.
     """
-    check_table_path(path)
+    _check_suffix(path)
     kinds: dict[str, Callable[[], bytes]] = {
         ".csv": lambda: table.to_csv(index=False).encode(),
         ".parquet": lambda: _parquet(table),
@@ -193,13 +194,17 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 
 def check_table_path(path: Path) -> None:
-    """Check that a table can be written to a path.
+    """Check that a table can be written to a path that a person named.
 
     Raises:
         InputError: it ends in something else than .csv, .parquet or .json, or is a file of a store.
         ModuleNotFoundError: what writes Parquet is not installed.
     """
     refuse_store_file(path, "--output")
+    _check_suffix(path)
+
+
+def _check_suffix(path: Path) -> None:
     if path.suffix not in (".csv", ".parquet", ".json"):
         raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
     if path.suffix == ".parquet":
