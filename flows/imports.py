@@ -21,7 +21,7 @@ from sliplab.storage.formats.adapted_trials import AdaptedSet, find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import format_names
-from sliplab.storage.formats.recognition import entered, kind_of, skipped_in, trials_in
+from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store, StoreError, refuse_url
 
@@ -66,18 +66,17 @@ def import_data(
         raise InputError("--dry-run", "", None, "is for an import with --adapter")
     if name is None:
         raise InputError("--name", "", None, "is missing: the name of the new campaign")
-    where = entered(path)
     if kind is not None and kind not in format_names():
         raise InputError("KIND", "", kind, one_of(kind, format_names()))
-    found_kind = kind_of(where) if kind is None else kind
+    found_kind = kind_of(path) if kind is None else kind
     _check_name(name)
-    skipped = skipped_in(where, found_kind)
-    found = trials_in(where, found_kind, salvage=salvage)
+    skipped = skipped_in(path, found_kind)
+    found = trials_in(path, found_kind, salvage=salvage)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
     with _new_store(store) as opened, store_lock(opened):
         result = import_trials(
-            opened, name, found, where, found_kind, lambda it: console.say(it), salvage=salvage
+            opened, name, found, path, found_kind, lambda it: console.say(it), salvage=salvage
         )
     _say_faults(result)
     for item in skipped:

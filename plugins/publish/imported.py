@@ -49,14 +49,14 @@ def publication_at(path: Path) -> Path | None:
     return folder if there and (folder / CAMPAIGNS).is_dir() else None
 
 
-def of_one_campaign(path: Path) -> Path:
-    """Return the folder of the one campaign of a publication of MCAP files; else the path itself.
+def of_one_campaign(path: Path) -> Path | None:
+    """Return the folder of the one campaign of a publication of MCAP files; None for others.
 
     Raises:
         InputError: the publication has several campaigns or none.
     """
     if not (path / CARD).is_file() or (path / STORE).exists() or not (path / CAMPAIGNS).is_dir():
-        return path
+        return None
     found = sorted(each for each in (path / CAMPAIGNS).iterdir() if each.is_dir())
     if len(found) != 1:
         raise _several(path, found)
@@ -236,4 +236,6 @@ class PublishedTrial:
 CROISSANT = Format(
     sniff=lambda path, head: publication_at(path) is not None, read_all=read_publication
 )
-LAYOUT = Layout(enter=of_one_campaign)
+LAYOUT = Layout(
+    folder=of_one_campaign, owns=lambda entry: of_one_campaign(entry.parent) is not None
+)

@@ -32,7 +32,7 @@ from sliplab.storage.formats.foreign import (
     event_chunk,
     resolution_us,
 )
-from sliplab.storage.formats.known import known_format
+from sliplab.storage.formats.known import joined, known_format
 from sliplab.storage.formats.numpy_files import MAGIC, array_of
 from sliplab.storage.formats.pictures import decode_picture, video_frames
 from sliplab.storage.formats.recognition import read_file
@@ -185,9 +185,11 @@ def read_events(
         return read_counts(array_of(data), part)
     if part.format in {"csv", "numpy"}:
         return _event_table(folder, names[0], part)
-    read_files = known_format(part.format).read_files
-    if read_files is not None:
-        return read_files(paths, "trial")
+    if known_format(part.format).read is None:
+        found = joined(dict.fromkeys(paths), part.format, paths[0])
+        if len(found) != 1:
+            raise FormatError(f"are files of {len(found)} recordings of {part.format}, not of one")
+        return found[0].read("trial", salvage)
     if len(paths) != 1:
         raise FormatError(f"are {len(paths)} files for one trial")
     return read_file(part.format, paths[0], "trial", salvage)

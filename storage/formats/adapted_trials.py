@@ -419,7 +419,7 @@ class _Finding:
         if name not in format_names():
             known = ", ".join((*OWN_FORMATS, *format_names()))
             raise self._error("streams.events.format", name, f"must be one of {known}")
-        return known_format(name).read_files is not None
+        return known_format(name).read is None  # a layout joins them
 
     def _warn_of_missing(self, trials: list[AdaptedTrial]) -> None:
         counts = Counter(key for trial in trials for key in trial.missing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def _never(path: Path, head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Format:
-    """A format; a function that it lacks is None.
+    """A format; a function that it lacks is None. A layout may join its files to recordings.
 
     Attributes:
         suffixes: endings of its files, in lower case and with the dot. They decide where no format
@@ -32,7 +32,6 @@ class Format:
             one data set.
         read: reads one file, or a folder that is one recording. salvage: reads the intact part
             before the damage in a damaged one.
-        read_files: reads the files of one recording that has several.
         read_all: reads the trials of a folder that is one data set.
         check: raises InputError or ModuleNotFoundError where a file's library is not installed.
         export: writes the events of one stream of a trial, and what else the format holds, to a
@@ -48,7 +47,6 @@ class Format:
     sniff: Callable[[Path, bytes], bool] = _never
     read: Reader | None = None
     salvage: Reader | None = None
-    read_files: Callable[[Sequence[Path], str], ForeignTrial] | None = None
     read_all: Callable[[Path], Iterator[ForeignTrial]] | None = None
     check: Callable[[Path], None] | None = None
     export: Callable[[Recording, Path, str], dict[str, int]] | None = None
@@ -64,7 +62,7 @@ class Files:
         stem: what the trial is named after.
         kind: name of their format.
         read: reads them as a trial of the given name; if the second argument is true, reads the
-            intact part of a damaged file.
+            intact part of a damaged file. Raises FormatError or InputError.
     """
 
     stem: str
@@ -81,16 +79,14 @@ class Layout:
     """Layout of the files and folders of recordings; plug-ins declare it as a hook.
 
     Attributes:
-        enter: returns the folder to be imported in place of a path; the path itself for any other
-            layout. It raises InputError where it cannot decide.
-        folder: returns the folder of the recordings' files in a path; None for any other layout.
-        owns: returns True if an entry of such a path is read together with the recordings.
+        folder: returns the folder of the recordings' files in a path; None for any other layout. It
+            raises InputError where it cannot decide.
+        owns: returns True if an entry of such a path belongs to the recordings.
         join: returns recordings of several files, among files with their formats (None: unknown).
             Its second argument is the format that the user named, its third the path for messages.
         complete: adds the files next to a recording in the path that is imported.
     """
 
-    enter: Callable[[Path], Path] = lambda path: path
     folder: Callable[[Path], Path | None] = lambda path: None
     owns: Callable[[Path], bool] = lambda entry: False
     join: Callable[[Mapping[Path, str | None], str | None, Path], list[Files]] = (

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
+from pathlib import Path
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.storage.formats.aedat4 import AEDAT4
 from sliplab.storage.formats.dsec import DSEC, LAB_HDF5
-from sliplab.storage.formats.format import Format, Layout
+from sliplab.storage.formats.format import Files, Format, Layout
 
 CORE = {"aedat4": AEDAT4, "dsec": DSEC, "lab-hdf5": LAB_HDF5}
 """Formats of the core, by name."""
@@ -76,6 +77,11 @@ def layouts() -> tuple[Layout, ...]:
         return tuple(plugins().hooks("layout"))
     except PluginError as error:
         raise InputError("PLUG-IN", "", "layout", f"cannot be loaded: {error}") from None
+
+
+def joined(files: Mapping[Path, str | None], kind: str | None, path: Path) -> list[Files]:
+    """Return the recordings of several files; arguments as those of `Layout.join`."""
+    return [each for layout in layouts() for each in layout.join(files, kind, path)]
 
 
 @cache

@@ -37,6 +37,7 @@ from sliplab.storage.formats.format import Files
 from sliplab.storage.formats.known import (
     CORE,
     format_names,
+    joined,
     known_format,
     known_formats,
     layouts,
@@ -53,17 +54,6 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?")
 """Names that no file has on Windows."""
 _LONGEST_NAME, _HASH = 200, 8
-
-
-def entered(path: Path) -> Path:
-    """Return the folder to be imported in place of a path; mostly the path itself.
-
-    Raises:
-        InputError: it holds several, of which one must be named.
-    """
-    for layout in layouts():
-        path = layout.enter(path)
-    return path
 
 
 def kind_of(path: Path) -> str:
@@ -124,7 +114,7 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
             if fault is not None:
                 yield broken(item["trial"], item["file"], InputError(file, "", None, fault))
                 continue
-            found = _read(of, file, item["trial"], salvage)
+            found = _opened(_single(file, of), item["trial"], salvage)
             yield _as_exported(found, item, manifest["simulated"])
         return
     laid_out = layouts()
@@ -138,7 +128,7 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
     yield from (_several(path, name, alike[name]) for name in alike if len(alike[name]) > 1)
     for name, each in wanted:
         if len(alike[name]) == 1:
-            found = each.read(name, salvage)
+            found = _opened(each, name, salvage)
             for layout in laid_out:
                 found = layout.complete(found, each, path)
             yield found
@@ -194,18 +184,18 @@ Wanted = tuple[str, Files]
 def _sort(path: Path) -> list[Wanted]:
     """Return what is known in a file or folder, each with its own format, by name."""
     kinds = {file: _kind(file) for file in _files(path)}
-    joined = [each for layout in layouts() for each in layout.join(kinds, None, path)]
-    taken = {file for each in joined for file in each.files}
+    several = joined(kinds, None, path)
+    taken = {file for each in several for file in each.files}
     found = [
         _single(file, kind)
         for file, kind in kinds.items()
         if kind is not None and file not in taken
     ]
-    return sorted(_named([*found, *joined]), key=lambda item: item[0])
+    return sorted(_named([*found, *several]), key=lambda item: item[0])
 
 
 def _single(file: Path, kind: str) -> Files:
-    return Files(_stem(file), kind, (file,), partial(_read, kind, file))
+    return Files(_stem(file), kind, (file,), partial(read_file, kind, file))
 
 
 def _named(found: list[Files]) -> list[Wanted]:
@@ -223,14 +213,12 @@ def _of_kind(path: Path, kind: str) -> list[Wanted]:
     wanted: list[Path] = []
     if how.read is not None:
         wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
-    joined = [
-        each for layout in layouts() for each in layout.join(dict.fromkeys(files), kind, path)
-    ]
-    if not (wanted or joined):
+    several = joined(dict.fromkeys(files), kind, path)
+    if not (wanted or several):
         endings = " or ".join(how.suffixes)
         raise InputError(path, "", None, f"holds no {kind} file; such files end in {endings}")
-    taken = {file for each in joined for file in each.files}
-    return _named([*(_single(file, kind) for file in wanted if file not in taken), *joined])
+    taken = {file for each in several for file in each.files}
+    return _named([*(_single(file, kind) for file in wanted if file not in taken), *several])
 
 
 def _several(path: Path, name: str, files: Sequence[str]) -> ForeignTrial:
@@ -353,11 +341,14 @@ def before_damage(
     raise Damage(f"{error}; {offer}", error.file)
 
 
-def _read(kind: str, file: Path, name: str, salvage: bool) -> ForeignTrial:
+def _opened(files: Files, name: str, salvage: bool) -> ForeignTrial:
+    """Return the trial in a recording's files, or the reason why it cannot be read."""
     try:
-        return read_file(kind, file, name, salvage)
+        return files.read(name, salvage)
     except FormatError as error:
-        return broken(name, file.name, refusal(error.file or file, error))
+        return broken(name, str(files), refusal(error.file or files.files[0], error))
+    except InputError as error:
+        return broken(name, str(files), error)
 
 
 def _stem(file: Path) -> str:

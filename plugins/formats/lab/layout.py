@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from sliplab.plugins.formats.lab.run import (
     with_run,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.foreign import ForeignTrial, FormatError, broken, refusal
+from sliplab.storage.formats.foreign import ForeignTrial, FormatError
 from sliplab.storage.formats.format import Files, Format, Layout
 from sliplab.storage.formats.recognition import read_file
 
@@ -61,21 +61,15 @@ def _join(files: Mapping[Path, str | None], kind: str | None, path: Path) -> lis
 def _read(pair: Pair, name: str, salvage: bool) -> ForeignTrial:
     """Return a recording of its stream, or else of its pickles."""
     note = ""
-    try:
-        if pair.stream is not None:
-            try:
-                found = read_file(LAB_HDF5, pair.stream, name, salvage)
-                return described(compare(found, pair), pair.stem)
-            except FormatError as error:
-                if pair.on is None and pair.off is None:
-                    raise FormatError(str(error), pair.stream) from None
-                note = f"{pair.stream.name} is not imported: {error}"
-        found = replace(read_pair(pair, name), kind=LAB_PICKLES)
-    except (FormatError, InputError) as error:
-        if isinstance(error, FormatError):
-            error = refusal(error.file or pair.files[0], error)
-        source = " and ".join(sorted(path.name for path in pair.files))
-        return broken(name, source, error)
+    if pair.stream is not None:
+        try:
+            found = read_file(LAB_HDF5, pair.stream, name, salvage)
+            return described(compare(found, pair), pair.stem)
+        except FormatError as error:
+            if pair.on is None and pair.off is None:
+                raise FormatError(str(error), pair.stream) from None
+            note = f"{pair.stream.name} is not imported: {error}"
+    found = replace(read_pair(pair, name), kind=LAB_PICKLES)
     return replace(found, notes=lambda: (*((note,) if note else ()), *found.notes()))
 
 
@@ -86,12 +80,5 @@ def _complete(trial: ForeignTrial, files: Files, path: Path) -> ForeignTrial:
     return with_run(trial, files.stem, run_folder(path))
 
 
-def _read_files(paths: Sequence[Path], name: str) -> ForeignTrial:
-    found = pairs(paths)
-    if len(found) != 1:
-        raise FormatError(f"are files of {len(found)} trials of the lab's names, not of one")
-    return read_pair(found[0], name)
-
-
-PICKLES = Format(read_files=_read_files)
+PICKLES = Format()  # joined by the layout
 LAYOUT = Layout(folder=_events_folder, owns=is_of_run, join=_join, complete=_complete)

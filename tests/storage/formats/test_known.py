@@ -47,7 +47,7 @@ def join(files, kind, path):
         len(halves) == 2
     )
 
-HALVES = Format(read_files=both)
+HALVES = Format()
 LAYOUT = Layout(join=join)
 """
 
