@@ -102,6 +102,10 @@ class Problem(ABC):
             each: makes those that are missing.
         """
 
+    def reason_against(self, step: str) -> str | None:
+        """Return why a study leaves out a step after collection; None where it can be done."""
+        return None
+
     def check(self) -> None:  # noqa: B027
         """Check that a network can be trained here.
 
@@ -373,6 +377,17 @@ class SlipByMarkers(Problem):
     """No slip, incipient and gross slip, by a classifier on marker displacements."""
 
     name = evaluation.NAME
+
+    def reason_against(self, step: str) -> str | None:
+        """See `Problem`; searches and hold-outs run a spiking network."""
+        if step not in {"sync", "label", "train", "evaluate", "report"}:
+            return "works with the spiking network on events, and there are none"
+        slides = any(item.experiment == "kinematic" for item in self.campaigns)
+        if step in {"train", "evaluate"} and not slides:
+            return (
+                "the classifier is trained on slides, and without events nothing else is evaluated"
+            )
+        return None
 
     def models(self) -> list[ModelOnDisk]:
         """See `Problem`."""

@@ -15,11 +15,11 @@ from functools import partial
 from sliplab.analysis.campaigns import (
     Collected,
     collected,
-    missing_stream,
 )
 from sliplab.analysis.evaluation.holdout import STEP
 from sliplab.analysis.labels.label_errors import CHECK
-from sliplab.analysis.report.one_camera import reason_against
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.problem import problem_of
 from sliplab.analysis.study_plan import PlannedCampaign, Search, StudyPlan
 from sliplab.flows.collect import CollectResult, collect
 from sliplab.flows.evaluate import evaluate
@@ -73,11 +73,10 @@ def study(
             taken.append(collect(run_request))
             on_done(taken[-1]["taken"])
     campaigns = collected(store, [run_request.campaign for run_request in run_requests])
-
-    missing, slides = missing_stream(campaigns), bool(planned.slides)
+    problem = problem_of(StoreLabels(store), campaigns)
 
     def run(name: str, unit: str, work: Callable[[], StepDone]) -> None:
-        if (reason := reason_against(name, missing, slides=slides)) is not None:
+        if (reason := problem.reason_against(name)) is not None:
             ledger.leave_out(name, reason)
             return
         with ledger.step(name, unit) as on_done:

@@ -53,26 +53,8 @@ from sliplab.storage.trials.store import Store, StoreError
 F64 = npt.NDArray[np.float64]
 BEFORE_S, BIN_S = 1.0, 0.1
 """Drawn time before the motion, and the interval over which a rate is taken."""
-CAN_BE_DONE = {"events": {"sync", "label", "train", "evaluate", "report"}}
-"""Steps after collection that need nothing of the missing stream; without frames, all do."""
-NO_EVENTS = "works with the spiking network on events, and there are none"
-NO_SLIDES = "the classifier is trained on slides, and without events nothing else is evaluated"
 NO_LABELS = "not done yet; run `sliplab label`"
 NO_CLASSIFIER = "not done yet; run `sliplab train`, then `sliplab evaluate`"
-
-
-def reason_against(step: str, missing: str | None, *, slides: bool = True) -> str | None:
-    """Return why a step cannot be done without a stream; None where it can.
-
-    Args:
-        missing: ``events`` or ``frames``; None where both were recorded.
-        slides: there is a kinematic campaign, whose trials train and test.
-    """
-    if missing == "events" and step in {"train", "evaluate"} and not slides:
-        return NO_SLIDES
-    if missing != "events" or step in CAN_BE_DONE[missing]:
-        return None
-    return NO_EVENTS
 
 
 def is_evaluated(store: Store, campaigns: Sequence[Collected]) -> bool:
@@ -129,8 +111,7 @@ def one_camera_summary(
         planned_bytes: of the committed trials, by campaign.
         judged: the classifier on marker displacements.
     """
-    missing = missing_stream(campaigns)
-    frames = missing == "events"
+    frames = missing_stream(campaigns) == "events"
     labels, rates = None, None
     labelled, evaluated = frames or has_labels(store, campaigns), is_evaluated(store, campaigns)
     if labelled:
@@ -148,11 +129,7 @@ def one_camera_summary(
         left_out=tuple(
             StepLeftOut(name=name, reason=reason)
             for name in ("label", "train", "evaluate")
-            if (
-                reason := reason_against(name, missing)
-                or _not_done(name, judged is not None or evaluated, labelled)
-            )
-            is not None
+            if (reason := _not_done(name, judged is not None or evaluated, labelled)) is not None
         ),
         labels=labels,
         event_rates=rates,
