@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sliplab.flows.notebook.arguments import checked, checked_methods
 from sliplab.flows.notebook.html import pairs_html, table_html
 from sliplab.flows.notebook.plan import PlanView
 from sliplab.flows.notebook.trial import (
@@ -70,6 +71,7 @@ __all__ = [
 ]
 
 
+@checked_methods
 class Store:
     """A store of trials: its catalogue, its trials, and the analysis steps.
 
@@ -100,13 +102,13 @@ class Store:
             where: only rows for which this holds, such as ``depth_mm > 2.5``.
 
         Raises:
-            ValueError: `where` cannot be answered.
+            InputError: `where` cannot be answered.
             StoreError: a trial is damaged.
         """
         from sliplab.storage.trials.catalogue import catalogue, query
 
         table = catalogue(self._store)
-        return table if where is None else query(table, where)
+        return table if where is None else query(table, where, "where")
 
     def trial(self, trial_id: str, campaign: str | None = None) -> Trial:
         """One trial.
@@ -144,7 +146,13 @@ class Store:
         *,
         predictions: pd.DataFrame | str | Path | None = None,
         model: str | Path | None = None,
-        **options: Any,
+        engine: str | None = None,
+        margin: float | None = None,
+        smoothing: int | None = None,
+        reviewed: bool = False,
+        baselines: bool = False,
+        checks: bool = False,
+        dask: str | None = None,
     ) -> dict[str, Any]:
         """Judge the network on test trials; or a model file, or any model by its predictions.
 
@@ -152,8 +160,7 @@ class Store:
             predictions: a row for each window that `windows` lists for ``test``, as a table or its
                 file; docs/models.md describes its columns.
             model: a model file.
-            options: of ``sliplab evaluate``: ``margin``, ``smoothing``, ``reviewed``,
-                ``baselines``, ``checks``, ``engine``, ``dask``.
+            engine, margin, smoothing, reviewed, baselines, checks, dask: see ``sliplab evaluate``.
 
         Raises:
             InputError: an argument, or predictions that do not fit, with all their faults.
@@ -163,10 +170,21 @@ class Store:
 
         if isinstance(predictions, str):
             predictions = Path(predictions)
-        options |= {"predictions": predictions, "model": None if model is None else Path(model)}
         names = None if campaigns is None else list(campaigns)
         with stopping.signals(), extras.named("Store.evaluate"):
-            return run_evaluation(self.folder, names, **options)
+            return run_evaluation(
+                self.folder,
+                names,
+                margin=margin,
+                smoothing=smoothing,
+                reviewed=reviewed,
+                baselines=baselines,
+                checks=checks,
+                model=None if model is None else Path(model),
+                engine=engine,
+                predictions=predictions,
+                dask=dask,
+            )
 
     def windows(
         self,
@@ -209,7 +227,7 @@ class Store:
 
         Args:
             split: whose labelled windows are taken.
-            windows: take these rows of `windows` instead; the class of one without is -1.
+            windows: take these rows of `windows` instead; the class is -1 where ``label`` is None.
 
         Raises:
             ModuleNotFoundError: the extra ``learn`` is not installed.
@@ -267,9 +285,27 @@ class Store:
         """Write trials or the store in a form of other programs; see `sliplab.export`."""
         return export(self.folder, form, output, part, **options)
 
-    def report(self, campaigns: Sequence[str] | None = None) -> Path:
-        """Write the report; returns its page."""
+    def report(
+        self, campaigns: Sequence[str] | None = None, *, against: str | Path | None = None
+    ) -> Path:
+        """Write the report; returns its page.
+
+        Args:
+            against: another store or its ``summary.json``; the page returned compares both.
+
+        Raises:
+            InputError: there is no such report.
+        """
+        from sliplab.flows.running import extras
+
+        with extras.named("Store.report"):
+            from sliplab.analysis.report.against import load_report
+            from sliplab.flows import report
+        if against is not None:
+            load_report(Path(against))  # wrong input fails before anything is made
         self._run("report", campaigns)
+        if against is not None:
+            return report.against(self._store, Path(against))[1]
         return self.folder / "report" / "index.html"
 
     def summary(self) -> dict[str, Any]:
@@ -313,7 +349,7 @@ class Store:
             who: empty for the user that is logged in.
 
         Raises:
-            ValueError: the text is empty or too long.
+            InputError: the text is empty or too long.
         """
         from sliplab.flows.log import add_note
 
@@ -363,6 +399,7 @@ class Store:
             return run_step(self.folder, None if campaigns is None else list(campaigns), step)
 
 
+@checked_methods
 class Model:
     """A trained network, run on events by the event-driven kernels."""
 
@@ -450,21 +487,22 @@ class Model:
             spikes of each class, int64, shape (n, classes).
 
         Raises:
-            ValueError: events are not in time order or lie outside of the camera, or the network's
+            InputError: events are not in time order or lie outside of the camera, or the network's
                 crop is larger than it.
         """
         from sliplab.analysis.networks import training
         from sliplab.analysis.windows.windows import list_events
 
-        windows = list_events(
-            EventChunk(events.x, events.y, events.p, events.t_ns // 1000),
-            np.asarray(start_ns) // 1000,
-            self.fitted.windows,
-            *size_px,
-        )
+        chunk = EventChunk(events.x, events.y, events.p, events.t_ns // 1000)
+        starts_us = np.asarray(start_ns) // 1000
+        try:
+            windows = list_events(chunk, starts_us, self.fitted.windows, *size_px)
+        except ValueError as error:
+            raise InputError("events", "", None, str(error)) from None
         return training.predict_counts(self.fitted, windows)
 
 
+@checked
 def open_store(place: str | Path) -> Store:
     """Open a store.
 
@@ -482,25 +520,26 @@ def open_store(place: str | Path) -> Store:
     return Store(mirror.open_store(Path(place)))
 
 
+@checked
 def load_model(path: str | Path) -> Model:
     """Load a network that `Store.train` or ``sliplab train`` made.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: it is not a model, or is damaged.
+        InputError: the file cannot be read, is not a model, or is damaged.
         ModuleNotFoundError: the extra ``learn`` is not installed.
     """
     from sliplab.flows.running import extras
 
     with extras.named("load_model"):
-        from sliplab.analysis.networks import model_file
+        from sliplab.flows.detecting.request import load_model as load
 
     place = Path(path)
     made_in = place.parent.parent  # of STORE/models/NAME.pt
     stored = (made_in / STORE).is_file() and TrialStore.open(made_in).simulated
-    return Model(model_file.load(place), stored)
+    return Model(load(place), stored)
 
 
+@checked
 def plan(protocol: str | Path, enable: Iterable[str] = ()) -> PlanView:
     """Expand a protocol to its trials, in the order in which they are taken.
 
@@ -515,6 +554,7 @@ def plan(protocol: str | Path, enable: Iterable[str] = ()) -> PlanView:
     return PlanView(found.protocol, found.file, found.enabled, found.trials)
 
 
+@checked
 def check(
     protocol: str | Path, rig: str | Path, store: str | Path, *, enable: Iterable[str] = ()
 ) -> Checks:
@@ -537,6 +577,7 @@ def check(
     return preflight.checks_json(found)
 
 
+@checked
 def verify(place: str | Path, *, quarantine: bool = False) -> Verification:
     """Check every checksum, count and clock of a store, as ``sliplab verify`` does.
 
@@ -555,6 +596,7 @@ def verify(place: str | Path, *, quarantine: bool = False) -> Verification:
     return run(str(place), quarantine)
 
 
+@checked
 def import_data(
     path: str | Path,
     store: str | Path,
@@ -601,6 +643,7 @@ def import_data(
         )
 
 
+@checked
 def export(
     place: str | Path, form: str, output: str | Path, part: str = "", **options: Any
 ) -> Json:
@@ -631,6 +674,7 @@ def export(
         return dict(exports.export(request).result)
 
 
+@checked
 def collect(
     protocol: str | Path,
     rig: str | Path,
@@ -664,28 +708,22 @@ def collect(
         sliplab.CampaignStopped: collection cannot continue; the message says why.
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
-    from pydantic import ValidationError
-
-    from sliplab.flows.planning.parameters import CollectOptions
+    from sliplab.flows.planning.parameters import CollectOptions, made
     from sliplab.flows.planning.run_request import make_request
     from sliplab.flows.running import extras, stopping
     from sliplab.flows.steps import prepare_store
-    from sliplab.protocols.key_errors import faults_of
 
-    try:
-        options = CollectOptions(
-            enable=list(enable),
-            trials=trials,
-            campaign=campaign,
-            operator=operator,
-            temperature_c=temperature,
-            humidity_percent=humidity,
-            note=note,
-            no_stopping=no_stopping,
-        )
-    except ValidationError as error:
-        fault = faults_of(CollectOptions, error)[0]
-        raise InputError(fault.key, "", fault.value, str(fault)) from None
+    options = made(
+        CollectOptions,
+        enable=list(enable),
+        trials=trials,
+        campaign=campaign,
+        operator=operator,
+        temperature_c=temperature,
+        humidity_percent=humidity,
+        note=note,
+        no_stopping=no_stopping,
+    )
     run_request = make_request(Path(protocol), Path(rig), Path(store), **options.arguments())
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)

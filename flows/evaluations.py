@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sliplab.flows.planning.parameters import RuleOptions, made
 from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
 
@@ -45,6 +46,7 @@ def run_evaluation(
         InputError: arguments that exclude each other, or that are wrong.
         StoreError: a label or a network is missing or stale.
     """
+    made(RuleOptions, margin=margin, smoothing=smoothing)
     options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
     if model is None and engine is not None:
         raise InputError("--engine", "", engine, "belongs to --model")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from sliplab.flows.running import run_records
 from sliplab.flows.running.console import duration
+from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside, read_json
 from sliplab.storage.streams import Json
@@ -53,21 +54,23 @@ class LogEntry:
     trials: tuple[str, ...] = ()
 
 
-def add_note(store: Store, text: str, *, who: str = "") -> LogEntry:
+def add_note(store: Store, text: str, *, who: str = "", argument: str = "text") -> LogEntry:
     """Add a note to the log. It may be added while trials are taken: no lock is needed.
 
     Args:
         who: empty for the user that is logged in.
+        argument: that gave the text.
 
     Raises:
-        ValueError: the text is empty or too long.
+        InputError: the text is empty or too long.
         OSError: it cannot be written.
     """
     text = text.strip()
     if not text:
-        raise ValueError("must not be empty")
+        raise InputError(argument, "", text, "must not be empty")
     if len(text) > MOST_CHARACTERS:
-        raise ValueError(f"has {len(text)} characters: must have {MOST_CHARACTERS} at most")
+        fault = f"has {len(text)} characters: must have {MOST_CHARACTERS} at most"
+        raise InputError(argument, "", text, fault)
     signed = signature(who, "")
     Journal(inside(store.folder / FOLDER, store.folder)).append({**signed, "text": text})
     return LogEntry(when=signed["when"], who=signed["who"], what="note", text=text)

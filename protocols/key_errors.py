@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from sliplab.protocols.quantity import number_meant
 from sliplab.protocols.shown import did_you_mean, foreign_character, nearest
 
-MISSING = "is missing"
+MISSING, UNKNOWN = "is missing", "unknown key"
 
 
 def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
@@ -24,7 +24,42 @@ def faults_of(model: type[BaseModel], error: ValidationError) -> list[KeyedError
 
     Unknown keys come first: one that is misspelt is the cause of a missing one, which is left out.
     """
-    return [each.with_key(each.key.removeprefix(".")) for each in faults_below(model, error)]
+    found = faults_below(model, error)
+    return [_placed(model, each.with_key(each.key.removeprefix("."))) for each in found]
+
+
+def _placed(model: type[BaseModel], fault: KeyedError) -> KeyedError:
+    """Return the fault of a key that is unknown where it is, with the place where it is known."""
+    name = fault.key.rpartition(".")[2]
+    if not str(fault).startswith(UNKNOWN) or (place := _place_of(name, model)) is None:
+        return fault
+    return KeyedError(fault.key, fault.value, f"{fault}; its place may be {place}")
+
+
+def _place_of(name: str, model: type[BaseModel]) -> str | None:
+    """Return the highest place at which a file may have a key; None without one."""
+    level: dict[Any, str] = {model: ""}
+    seen: set[Any] = set()
+    while level:
+        below: dict[Any, str] = {}
+        for each, before in level.items():
+            for key, field in each.model_fields.items():
+                key = field.alias or key
+                if key == name:
+                    return f"{before}{key}" if before else f"the top level ({key})"
+                for inner in _models_in(field.annotation):
+                    below.setdefault(inner, f"{before}{key}.")
+        seen |= level.keys()
+        level = {each: before for each, before in below.items() if each not in seen}
+    return None
+
+
+def _models_in(annotation: Any) -> Iterator[Any]:
+    if hasattr(annotation, "model_fields"):
+        yield annotation
+        return
+    for part in get_args(annotation):
+        yield from _models_in(part)
 
 
 def faults_below(model: type[BaseModel], error: ValidationError) -> list[KeyedError]:
@@ -93,7 +128,7 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
         known = f" (known here: {', '.join(names)})" if names else ""
         foreign = foreign_character(str(loc[-1]))
         hint = (f" (holds {foreign})" if foreign else "") + hint
-        return KeyedError(key, value, f"unknown key{hint}{known}")
+        return KeyedError(key, value, f"{UNKNOWN}{hint}{known}")
     if kind == "missing":
         return KeyedError(key, None, MISSING)
     if kind == "value_error":

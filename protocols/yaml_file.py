@@ -47,6 +47,8 @@ from sliplab.protocols.shown import (
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
 
 class StrictModel(BaseModel):
@@ -383,7 +385,8 @@ def read_text(path: Path, what: str) -> str:
             data = handle.read(MAX_BYTES + 1)
     except FileNotFoundError:
         near = did_you_mean(path.name, neighbours(path))
-        raise InputError(path, "", None, f"no such file; {of_one}{near}") from None
+        what = "is a URL, not a file" if _URL.match(str(path)) else "no such file"
+        raise InputError(path, "", None, f"{what}; {of_one}{near}") from None
     except IsADirectoryError:
         raise InputError(path, "", None, f"is a folder; {of_one}") from None
     except OSError as error:

@@ -49,7 +49,7 @@ def writable_target(rig: Path, out: Path | None) -> Path:
             f"is needed: {target.name} ships with SlipLab and is never overwritten; "
             "write to a file of your own",
         )
-    if target.suffix not in {".yaml", ".yml"}:
+    if target.suffix.lower() not in {".yaml", ".yml"}:
         raise InputError("--out" if out else rig, "", str(target), "must end in .yaml")
     if not target.parent.is_dir():
         raise InputError("--out", "", str(target), "its folder does not exist")

@@ -104,7 +104,7 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
     Raises:
         InputError: file, key, value and what would be right.
     """
-    if path.suffix in {".yaml", ".yml", ".json"}:
+    if path.suffix.lower() in {".yaml", ".yml", ".json"}:
         return _described(path, engine)
     try:
         content = read_plain(path)

@@ -34,7 +34,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.trial_work import KeepTrials
 from sliplab.analysis.windows.dataset import TrialId
-from sliplab.analysis.windows.window_table import LabelledWindows, trial_windows
+from sliplab.analysis.windows.window_table import LabelledWindows, trial_windows, whole_ns
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.later import need
@@ -91,9 +91,9 @@ def read_predictions(path: Path) -> pd.DataFrame:
         ModuleNotFoundError: a Parquet file, and the extra ``parquet`` is not installed.
     """
     try:
-        if path.suffix == ".csv":
+        if path.suffix.lower() == ".csv":
             return pd.read_csv(path, dtype={"campaign": str, "trial": str, "class": str})
-        if path.suffix == ".parquet":
+        if path.suffix.lower() == ".parquet":
             need("pyarrow")
             return pd.read_parquet(path)
     except OSError as error:
@@ -124,13 +124,13 @@ def prediction_judgement(
     data_key(labels, campaigns)  # every test trial has a label
     path = source if isinstance(source, Path) else None
     where = "--predictions" if path is None else str(path)
-    kind, table = _checked(read_predictions(path) if path else source, where)
+    kind, table, faults = _checked(read_predictions(path) if path else source, where)
     if kind != "spikes":
         margin = 0.0 if margin is None else margin
         if margin > 1:
-            raise InputError("--margin", "", margin, "must be a share from 0 to 1 here")
+            faults.append(InputError("--margin", "", margin, "must be a share from 0 to 1 here"))
     known = list(trial_windows(labels, campaigns, "test"))
-    found = _outputs(table, known, where)
+    found = _outputs(table, known, where, faults)
     outputs = {}
     for it in known:
         starts, values = it.starts_ns, found[it.trial]
@@ -155,11 +155,13 @@ def prediction_judgement(
     return PredictionJudgement(**vars(judgement), outputs=outputs, scale=_SCALE[kind])
 
 
-def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
+def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame, list[InputError]]:
     """Return what the table holds, and it with whole outputs in the columns 0, 1 and 2.
 
+    Rows without a time are left out. The last value are the faults of cells that are no values.
+
     Raises:
-        InputError: a column is missing, or cells are no values.
+        InputError: a column is missing.
     """
     kinds = [kind for kind, names in COLUMNS.items() if set(names) <= set(table.columns)]
     faults = [
@@ -175,7 +177,7 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
         raise InputError.joined(faults)
     (kind,) = kinds
     names = COLUMNS[kind]
-    start = pd.to_numeric(table["start_ns"], errors="coerce")
+    starts, whole = whole_ns(table["start_ns"])
     result = table[[name for name in ("campaign", "trial") if name in table.columns]].astype(str)
     if kind == "class":
         number = {name: k for k, name in enumerate(CLASSES)}
@@ -194,7 +196,6 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
             good &= (cells % 1 == 0).all(axis=1)
             right = f"must be whole numbers from 0 to {MOST_SPIKES:,}"
         values = np.rint(cells * _SCALE[kind]).astype(np.int64)
-    whole = (start.notna() & (start % 1 == 0)).to_numpy()
     for key, fits, words in (
         ("start_ns", whole, "must be whole nanoseconds"),
         (", ".join(names), good, right),
@@ -202,26 +203,28 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame]:
         if not fits.all():
             rows = np.flatnonzero(~fits)
             faults.append(InputError(where, key, None, f"{words}; {_rows(rows)}"))
-    if faults:
-        raise InputError.joined(faults)
-    result["start_ns"] = start.astype(np.int64)
+    result["start_ns"] = starts
     result[list(range(len(CLASSES)))] = values
-    return kind, result
+    return kind, result[whole], faults
 
 
-def _outputs(table: pd.DataFrame, known: list[LabelledWindows], where: str) -> dict[TrialId, I64]:
+def _outputs(
+    table: pd.DataFrame, known: list[LabelledWindows], where: str, faults: list[InputError]
+) -> dict[TrialId, I64]:
     """Return the outputs (n, 3) of each trial's windows, in the order of time.
+
+    Args:
+        faults: that were found already.
 
     Raises:
         InputError: with all that does not fit.
     """
-    faults: list[InputError] = []
     if "campaign" not in table.columns:
         holders = pd.Series([it.trial.campaign for it in known], [it.trial.trial for it in known])
         twice = sorted(set(holders.index[holders.index.duplicated()]) & set(table["trial"]))
         if twice:
             text = f"is needed: several campaigns have {_listed(twice)}"
-            raise InputError(where, "campaign", None, text)
+            raise InputError.joined([*faults, InputError(where, "campaign", None, text)])
         table = table.assign(campaign=table["trial"].map(holders))
     rows = {
         TrialId(*map(str, key)): part

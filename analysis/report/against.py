@@ -33,6 +33,7 @@ from sliplab.storage.schema.classes import ClassSummary
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import refuse_url
 
 Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
 
@@ -172,16 +173,18 @@ def load_report(place: Path, option: str = "--against") -> Document:
     Raises:
         InputError: it does not exist, is damaged, or has another version.
     """
+    refuse_url(place)
     path = place.joinpath(*SUMMARY) if place.is_dir() else place
+    right = "must be a store with a report, or its report/summary.json"
     why = ""
     for kind in (Summary, OneCameraSummary, ClassSummary):
         try:
             return kind.load(path)
         except OSError as error:
-            why = f"must be a store with a report, or its report/summary.json ({error})"
+            why = f"{right} ({error})"
         except DocumentError as error:
             again = "run `sliplab report` on it with this version"
-            why = why or f"lacks what is compared ({error}); {again}"
+            why = why or f"{right}; lacks what is compared ({error}): {again}"
         except NewerFormat as error:
             why = str(error)
     raise InputError(option, "", str(place), why)

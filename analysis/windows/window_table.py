@@ -22,6 +22,13 @@ SPLITS = ("train", "validation", "test")
 I64 = npt.NDArray[np.int64]
 
 
+def whole_ns(column: pd.Series) -> tuple[I64, npt.NDArray[np.bool_]]:
+    """Return times as integers, 0 where they are not whole nanoseconds, and where they are."""
+    values = pd.to_numeric(column, errors="coerce")
+    good = (values.abs() < 2**63) & (values % 1 == 0)  # NaN is neither
+    return values.where(good, 0).to_numpy(np.int64), good.to_numpy(np.bool_)
+
+
 @dataclass(frozen=True)
 class LabelledWindows:
     """The windows of one trial.

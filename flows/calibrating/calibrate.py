@@ -198,7 +198,7 @@ def print_board(board: Board, path: Path) -> dict[str, float]:
     Raises:
         InputError: the file's name ends in neither .pdf nor .png, or its folder is missing.
     """
-    if path.suffix not in {".pdf", ".png"}:
+    if path.suffix.lower() not in {".pdf", ".png"}:
         raise InputError("--out", "", str(path), "must end in .pdf or .png")
     if not path.parent.is_dir():
         raise InputError("--out", "", str(path), "its folder does not exist")
@@ -229,7 +229,7 @@ def print_board(board: Board, path: Path) -> dict[str, float]:
     axes.text(left, y - 4, text, fontsize=6, va="top")
     make_folder(path.parent)
     dpi = PNG_PX_PER_MM * _MM_PER_INCH
-    if path.suffix == ".pdf":
+    if path.suffix.lower() == ".pdf":
         figure.savefig(path, format="pdf", metadata={"CreationDate": None})
     else:
         figure.savefig(path, format="png", dpi=dpi)

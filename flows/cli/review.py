@@ -208,7 +208,7 @@ def view(
         if as_json:
             console.print_json({"trial": trial, "file": None})
         return
-    if save.suffix != ".rrd" or not save.parent.is_dir():
+    if save.suffix.lower() != ".rrd" or not save.parent.is_dir():
         raise InputError("--save", "", str(save), "must end in .rrd and its folder must exist")
     counts = looking.save(subject, save)
     if as_json:

@@ -26,13 +26,19 @@ def schema(
             show_default=False,
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Write to this file instead; without KIND, all to this folder."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the JSON Schema of a protocol, a rig file, an adapter or a document in a store."""
     from sliplab.flows.planning.json_schemas import file_schema, kinds
     from sliplab.storage.files import make_folder, write_json
 
+    if kind is None and out is not None:
+        _write_all(out, as_json)
+        return
     if kind is None:
         if as_json:
             console.print_json({"kinds": kinds()})
@@ -51,3 +57,19 @@ def schema(
     make_folder(out.parent)
     write_json(out, made)
     finish({"kind": kind, "file": str(out)}, f"schema {kind}", as_json)
+
+
+def _write_all(folder: Path, as_json: bool) -> None:
+    """Write every schema as ``KIND.json``."""
+    from sliplab.flows.planning.json_schemas import file_schema, kinds
+    from sliplab.storage.files import make_folder, write_json
+    from sliplab.storage.trials.catalogue import refuse_store_file
+
+    if folder.suffix.lower() == ".json" or (folder.exists() and not folder.is_dir()):
+        raise InputError("--out", "", str(folder), "must be a folder; one file needs a KIND")
+    for kind in kinds():
+        refuse_store_file(folder / f"{kind}.json", "--out")
+    make_folder(folder)
+    for kind in kinds():
+        write_json(folder / f"{kind}.json", file_schema(kind))
+    finish({"kinds": kinds(), "folder": str(folder)}, "schema", as_json)

@@ -67,15 +67,11 @@ def log(
 ) -> None:
     """Print who did what and when, or add a note. Notes may be added while trials are taken."""
     from sliplab.flows.log import add_note, log_entries
-    from sliplab.protocols.errors import InputError
     from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     if text is not None:
-        try:
-            entry = add_note(opened, text, who=who)
-        except ValueError as error:
-            raise InputError("TEXT", "", text, str(error)) from None
+        entry = add_note(opened, text, who=who, argument="TEXT")
         if as_json:
             console.print_json(vars(entry))
         else:

@@ -65,10 +65,7 @@ def trials(
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:
-        try:
-            table = query(table, where)
-        except ValueError as error:
-            raise InputError("--where", "", where, str(error)) from None
+        table = query(table, where, "--where")
     if output is not None:
         from sliplab.storage.trials.catalogue import check_table_path, write_table
 

@@ -9,12 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.windows.dataset import cut_windows
+from sliplab.analysis.windows.dataset import cut_windows, recorded_span
 from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.analysis.windows.window_table import whole_ns
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of, plural
 from sliplab.protocols.windows import Windows
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import NoTrial, Store
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,20 +35,51 @@ def classes_of(windows: pd.DataFrame) -> I64:
     return windows["label"].map(number).fillna(-1).to_numpy(np.int64)
 
 
-def _by_trial(store: Store, windows: pd.DataFrame) -> dict[tuple[str, str], tuple[Recording, I64]]:
+def _by_trial(
+    store: Store, windows: pd.DataFrame, length_ns: int
+) -> dict[tuple[str, str], tuple[Recording, I64]]:
     """Return each trial's recording, and its rows in `windows`.
 
     Raises:
-        InputError: a column is missing. StoreError: there is no such trial.
+        InputError: with all faults: a column that is missing, a time or a label that is none, a
+            trial that the store lacks, a window outside of the recording.
     """
-    for name in ("campaign", "trial", "start_ns"):
-        if name not in windows.columns:
-            raise InputError("windows", name, None, "is missing; `Store.windows` makes the table")
-    groups = windows.groupby(["campaign", "trial"], sort=False).indices
-    return {
-        (campaign, trial): (store.campaign(campaign).recording(trial), np.asarray(rows))
-        for (campaign, trial), rows in groups.items()
-    }
+    faults = [
+        InputError("windows", name, None, "is missing; `Store.windows` makes the table")
+        for name in ("campaign", "trial", "start_ns", "label")
+        if name not in windows.columns
+    ]
+    if faults:
+        raise InputError.joined(faults)
+    label, (starts, whole) = windows["label"], whole_ns(windows["start_ns"])
+    for name, good, right in (
+        ("start_ns", whole, "must be whole nanoseconds"),
+        ("label", (label.isna() | label.isin(CLASSES)).to_numpy(), one_of("", (*CLASSES, "None"))),
+    ):
+        if not good.all():
+            row = int(np.flatnonzero(~good)[0])
+            text = f"{right}; not so in {plural(int((~good).sum()), 'row')}"
+            faults.append(InputError("windows", f"{name}[{row}]", windows[name].iloc[row], text))
+    found = {}
+    for (campaign, trial), rows in windows.groupby(
+        ["campaign", "trial"], sort=False, dropna=False
+    ).indices.items():
+        try:
+            recording = store.holder(trial, campaign).recording(trial)
+        except NoTrial as error:
+            faults.append(InputError("windows", f"trial[{rows[0]}]", trial, error.expected))
+            continue
+        found[campaign, trial] = recording, np.asarray(rows)
+        begin, end = recorded_span(recording)
+        outside = (starts[rows] <= begin - length_ns) | (starts[rows] >= end)
+        outside &= whole[rows]
+        if outside.any():
+            row = rows[outside.argmax()]
+            text = f"lies outside of the recording of {trial}, from {begin} to {end} ns"
+            faults.append(InputError("windows", f"start_ns[{row}]", int(starts[row]), text))
+    if faults:
+        raise InputError.joined(faults)
+    return found
 
 
 def event_counts(store: Store, windows: pd.DataFrame, shape: Windows) -> SparseWindows:
@@ -56,8 +89,8 @@ def event_counts(store: Store, windows: pd.DataFrame, shape: Windows) -> SparseW
         shape: crop, cells, steps and length of a window.
     """
     parts, places = [], [np.empty(0, np.int64)]
-    for recording, rows in _by_trial(store, windows).values():
-        starts = windows["start_ns"].to_numpy(np.int64)[rows]
+    for recording, rows in _by_trial(store, windows, shape.length_ms * 1_000_000).values():
+        starts = whole_ns(windows["start_ns"])[0][rows]
         order = np.argsort(starts, kind="stable")
         parts.append(cut_windows(recording, starts[order], shape))
         places.append(rows[order])
@@ -91,7 +124,7 @@ class EventDataset:
     ) -> None:
         self.windows, self._length_ns = windows, length_ns
         self.transform, self.target_transform = transform, target_transform
-        trials = _by_trial(store, windows)
+        trials = _by_trial(store, windows, length_ns)
         self._recordings = {key: recording for key, (recording, _) in trials.items()}
         sizes = {recording.event_px for recording in self._recordings.values()}
         if len(sizes) > 1:

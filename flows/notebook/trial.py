@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.flows.notebook.arguments import checked_methods
 from sliplab.flows.notebook.html import pairs_html
 from sliplab.flows.running import extras
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
@@ -94,6 +97,7 @@ class WindowCounts:
     """End of each window on the time line, nanoseconds, shape (n,)."""
 
 
+@checked_methods
 class Trial:
     """One committed trial as arrays on one time line.
 
@@ -228,8 +232,11 @@ class Trial:
         """Start and end of a phase of the motion on the time line, nanoseconds.
 
         Raises:
-            KeyError: the motion has no such phase.
+            InputError: the motion has no such phase.
         """
+        phases = dict.fromkeys(each.phase for each in self.recording.record.steps)
+        if phase not in phases:
+            raise InputError("phase", "", phase, one_of(phase, phases))
         return self.recording.step(phase)
 
     @cached_property

@@ -6,11 +6,32 @@ what only they have (`flows.server.schedules`).
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Any, TypeVar
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import faults_of
 from sliplab.protocols.yaml_file import StrictModel
+
+_UNIT = re.compile("_(c|percent)$")
+OptionsT = TypeVar("OptionsT", bound=StrictModel)
+
+
+def made(kind: type[OptionsT], **values: Any) -> OptionsT:
+    """Return parameters of a kind.
+
+    Raises:
+        InputError: with all faults; keys lack their units, as arguments of functions do.
+    """
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        faults = faults_of(kind, error)
+        raise InputError.joined(
+            InputError(_UNIT.sub("", each.key), "", each.value, str(each)) for each in faults
+        ) from None
 
 
 class TrialChoice(StrictModel):

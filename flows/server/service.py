@@ -59,7 +59,7 @@ class Service:
         found = (Path(self.protocols[0]) / given).resolve()
         roots = [Path(root) for root in self.protocols]
         if not any(found == root or root in found.parents for root in roots) or (
-            found.suffix not in SUFFIXES
+            found.suffix.lower() not in SUFFIXES
         ):
             below = ", ".join(self.protocols)
             raise InputError(

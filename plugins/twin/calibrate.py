@@ -104,7 +104,7 @@ def request(
         InputError: the rig is not a simulated one in virtual time, or the new file cannot be made.
     """
     rig = fitted_rig(rig_path)
-    if out.suffix not in {".yaml", ".yml"}:
+    if out.suffix.lower() not in {".yaml", ".yml"}:
         raise InputError("--out", "", str(out), "must end in .yaml")
     if not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -270,17 +271,17 @@ class Remote:
             return False
         return True
 
-    def get(self, key: str, path: Path, known: Checksum) -> None:
+    def get(self, key: str, path: Path, known: Checksum, stop: Event | None = None) -> None:
         """Fetch an object into `path`, which appears once all of it matches its checksum.
 
-        It is read-only, as a committed file is.
+        It is read-only, as a committed file is. Once `stop` is set, it is left.
 
         Raises:
             RemoteMissing: it does not exist.
             RemoteError: it cannot be read, or does not match its checksum.
             OSError: `path` cannot be written.
         """
-        write_blocks(path, self._checked(key, known), COMMITTED)
+        write_blocks(path, self._checked(key, known, stop), COMMITTED)
 
     def put(self, key: str, source: bytes | Path) -> None:
         """Write an object from bytes or a file, in one step as far as the storage can."""
@@ -304,10 +305,12 @@ class Remote:
             pass
 
     @interruptible
-    def _checked(self, key: str, known: Checksum) -> Iterator[bytes]:
+    def _checked(self, key: str, known: Checksum, stop: Event | None = None) -> Iterator[bytes]:
         """Yield an object's bytes, and raise `RemoteDamaged` at their end if they do not match."""
         digest, size = hashlib.sha256(), 0
         for block in self._blocks(key, known.bytes and known.bytes + 1):
+            if stop is not None and stop.is_set():
+                raise RemoteError(f"{self.where(key)}: was stopped")
             digest.update(block)
             size += len(block)
             yield block

@@ -8,9 +8,11 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 
 from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError, translated_disk_errors
@@ -56,6 +58,8 @@ LACKS_NOTES = "lacks_notes"
 BIG = frozenset({DATA, FRAMES})
 """Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
+_AT_ONCE = 4
+"""Files of a trial that are fetched side by side."""
 _ASIDE = ".aside"
 """End of the name of a quarantined folder while it is downloaded."""
 
@@ -354,9 +358,9 @@ class _Pull:
         """Fetch the big files that a mirror left out."""
         if self.small or not (target / ELSEWHERE).exists():
             return
-        for name in sorted(filter(_big, manifest.files)):
-            if to_fetch(target / name):
-                self._count(_get(self.remote, manifest, name, target))
+        names = [name for name in filter(_big, manifest.files) if to_fetch(target / name)]
+        for size in _fetched(self.remote, manifest, names, target):
+            self._count(size)
         (target / ELSEWHERE).unlink()
         sync_folder(target)
 
@@ -416,13 +420,11 @@ def download(
     sweep_temporary(staging)
     marker = staging / ELSEWHERE
     write_json(marker, {"take": manifest.take})
-    for name, known in sorted(manifest.files.items()):
-        if small and _big(name):
-            continue
-        if known.problem(staging / name) is not None:
-            size = _get(remote, manifest, name, staging)
-            if on_file is not None:
-                on_file(size)
+    wanted = {name: known for name, known in manifest.files.items() if not (small and _big(name))}
+    names = [name for name, known in wanted.items() if known.problem(staging / name) is not None]
+    for size in _fetched(remote, manifest, names, staging):
+        if on_file is not None:
+            on_file(size)
     if manifest.kind == "trials":
         try:
             read_sums(staging)
@@ -442,10 +444,31 @@ def download(
     sync_folder(target.parent)
 
 
-def _get(remote: Remote, manifest: Manifest, name: str, folder: Path) -> int:
+def _fetched(
+    remote: Remote, manifest: Manifest, names: Iterable[str], folder: Path
+) -> Iterator[int]:
+    """Fetch files of a manifest, a few at once; yield the bytes of each, in the names' order.
+
+    An error or an interruption ends the others at their next block.
+    """
+    stop = Event()
+    with ThreadPoolExecutor(_AT_ONCE, "fetch") as pool:
+        try:
+            parts = [
+                pool.submit(_get, remote, manifest, name, folder, stop) for name in sorted(names)
+            ]
+            for part in parts:
+                yield part.result()
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _get(remote: Remote, manifest: Manifest, name: str, folder: Path, stop: Event) -> int:
     """Fetch one file of a manifest; return its size in bytes."""
     try:
-        remote.get(manifest.object_key(name), folder / name, manifest.files[name])
+        remote.get(manifest.object_key(name), folder / name, manifest.files[name], stop)
     except RemoteError as error:
         raise RemoteError(f"{remote.where(manifest.key)}: {name}: {error}") from None
     return manifest.files[name].bytes

@@ -84,22 +84,23 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     return _rebuilt(store, parts, known, began_ns)
 
 
-def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
+def query(table: pd.DataFrame, expression: str, argument: str) -> pd.DataFrame:
     """Return the rows for which a pandas expression holds.
 
     Args:
         expression: such as ``depth_mm > 2.8 and events > 1000``.
+        argument: that gave it.
 
     Raises:
-        ValueError: the expression cannot be read, or names something besides columns.
+        InputError: the expression cannot be read, or names something besides columns.
     """
     if fault := _expression_fault(expression):
-        raise ValueError(fault)
+        raise InputError(argument, "", expression, fault)
     try:
         return table.query(expression, engine="python", local_dict={}, global_dict={})
     except Exception as error:
-        columns = ", ".join(map(str, table.columns))
-        raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None
+        text = f"cannot be read ({error}); the columns are {', '.join(map(str, table.columns))}"
+        raise InputError(argument, "", expression, text) from None
 
 
 _LONGEST = 1000
@@ -190,7 +191,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
         ".json": lambda: table.to_json(orient="records").encode(),
     }
     make_folder(path.parent)
-    write_bytes(path, kinds[path.suffix]())
+    write_bytes(path, kinds[path.suffix.lower()]())
 
 
 def check_table_path(path: Path) -> None:
@@ -205,9 +206,9 @@ def check_table_path(path: Path) -> None:
 
 
 def _check_suffix(path: Path) -> None:
-    if path.suffix not in (".csv", ".parquet", ".json"):
+    if path.suffix.lower() not in (".csv", ".parquet", ".json"):
         raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
-    if path.suffix == ".parquet":
+    if path.suffix.lower() == ".parquet":
         need("pyarrow")
 
 

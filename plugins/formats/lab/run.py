@@ -227,7 +227,7 @@ def _untimed(run: Path, stem: str) -> list[str]:
         for folder in folders
         if folder.is_dir()
         for path in sorted(folder.iterdir())
-        if path.stem.endswith(f"_{stem}") and path.suffix in _VIDEO_ENDINGS
+        if path.stem.endswith(f"_{stem}") and path.suffix.lower() in _VIDEO_ENDINGS
     )
     cameras = _cameras(run)
     return [path.name for path in found if path.stem.removesuffix(f"_{stem}") not in cameras]
