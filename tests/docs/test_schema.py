@@ -233,5 +233,11 @@ def test_the_command_prints_and_writes_it(
     capsys.readouterr()
     assert not app(["schema", "protocol"], standalone_mode=False)
     assert json.loads(capsys.readouterr().out) == file_schema("protocol")
+    assert not app(["schema", "--out", str(tmp_path / "all")], standalone_mode=False)
+    written = {path.stem: path.read_text() for path in (tmp_path / "all").iterdir()}
+    assert set(written) == set(kinds())
+    assert json.loads(written["rig"]) == file_schema("rig")
+    with pytest.raises(InputError, match="must be a folder; one file needs a KIND"):
+        app(["schema", "--out", str(out)], standalone_mode=False)
     with pytest.raises(InputError, match="must be one of protocol, rig, adapter, trial, label"):
         app(["schema", "store"], standalone_mode=False)

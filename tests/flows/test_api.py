@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import math
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import sliplab
+from sliplab.flows import api
 from sliplab.flows.collecting.requests import CampaignStopped
+from sliplab.flows.notebook import arguments
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store as TrialStore
 from tests.command_line import here
@@ -151,6 +156,58 @@ def test_what_is_not_there_is_named(store: sliplab.Store, tmp_path: Path) -> Non
     assert not (tmp_path / "new").exists()
 
 
+def public_functions() -> dict[str, Any]:
+    """Every public function and method of the interface."""
+    found = {name: getattr(api, name) for name in api.__all__}
+    kinds = (api.Store, api.Trial, api.Model)
+    methods = {f"{kind.__name__}.{name}": it for kind in kinds for name, it in vars(kind).items()}
+    return {
+        name: it
+        for name, it in {**found, **methods}.items()
+        if inspect.isfunction(it) and "._" not in name
+    }
+
+
+@pytest.mark.parametrize("name", public_functions())
+def test_every_argument_of_a_wrong_type_is_named(name: str) -> None:
+    function = public_functions()[name]
+    assert hasattr(function, "__wrapped__")
+    for key, parameter in inspect.signature(function).parameters.items():
+        if key == "self" or parameter.kind is parameter.VAR_KEYWORD:
+            continue
+        with pytest.raises(sliplab.InputError, match=f"^{key} = .*: must be "):
+            arguments._checked(key, object(), parameter.annotation)
+
+
+def test_wrong_arguments_are_named_with_what_is_right(store: sliplab.Store, tmp_path: Path) -> None:
+    trial = store.trial(FIRST)
+    for call, words in {
+        lambda: sliplab.open_store(None): "place: must be text or a path",  # type: ignore[arg-type]
+        lambda: sliplab.load_model(tmp_path / "none.pt"): "none.pt: cannot be read: No such file",
+        lambda: sliplab.plan("pilot", enable=[1]): "enable = [1]: must be a list of names",  # type: ignore[list-item]
+        lambda: sliplab.collect("pilot", "rehearsal", tmp_path, temperature=math.nan): (
+            "temperature = .nan: must be a finite number or None"
+        ),
+        lambda: sliplab.collect("pilot", "rehearsal", tmp_path, trials=0, humidity=200): (
+            "humidity = 200: must be less than or equal to 100"
+        ),
+        lambda: sliplab.check("pilot"): (  # type: ignore[call-arg]
+            "check(): missing a required argument: 'rig'; its arguments are protocol, rig, store"
+        ),
+        lambda: store.evaluate(margin=-1): "margin = -1: must be greater than or equal to 0",
+        lambda: store.evaluate(colour=1): "evaluate(): got an unexpected keyword argument 'colour'",  # type: ignore[call-arg]
+        lambda: store.note(" "): "text = '': must not be empty",
+        lambda: store.trials("depth_mm"): "where = depth_mm: cannot be read",
+        lambda: store.report(against="none"): "--against = none: must be a store with a report",
+        lambda: trial.events(0.5): "start_ns = 0.5: must be a whole number or None",  # type: ignore[arg-type]
+        lambda: trial.step("slid"): "phase = slid: must be one of approach,",
+    }.items():
+        with pytest.raises(sliplab.InputError) as caught:
+            call()
+        assert words in str(caught.value)
+    assert list(store.windows("test", "small")["campaign"].unique()) == ["small"]
+
+
 def test_a_plan_as_a_table(store: sliplab.Store) -> None:
     plan = sliplab.plan("pilot")
     assert repr(plan) == "<Plan pilot: 36 trials, 0.18 h of motion>"
@@ -221,6 +278,19 @@ def test_windows_are_items_of_torch_and_of_tonic(store: sliplab.Store) -> None:
     assert store.torch_dataset(windows=unlabelled)[0][1] == -1
     with pytest.raises(sliplab.InputError, match="windows: start_ns: is missing"):
         store.torch_dataset(windows=windows.drop(columns="start_ns"))
+    few = windows.head(4)
+    wrong = few.assign(start_ns=[math.nan, 0.5, 1e30, 1 << 60], label=[None, "slip", None, None])
+    wrong["trial"] = ["nobody", *wrong["trial"][1:]]
+    for dataset in (store.torch_dataset, store.tonic_dataset):
+        with pytest.raises(sliplab.InputError) as caught:
+            dataset(windows=wrong)
+        for words in (
+            "windows: start_ns[0] = .nan: must be whole nanoseconds; not so in 3 rows",
+            "windows: label[1] = slip: must be one of no_slip, incipient, gross, None",
+            "windows: trial[0] = nobody: is no committed trial",
+            f"windows: start_ns[3] = {1 << 60}: lies outside of the recording of",
+        ):
+            assert words in str(caught.value)
 
 
 def test_a_trial_is_described_for_xarray(store: sliplab.Store) -> None:

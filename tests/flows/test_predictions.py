@@ -138,12 +138,14 @@ def test_all_faults_are_named_at_once_with_exit_code_2(
     store: sliplab.Store, own: pd.DataFrame, tmp_path: Path
 ) -> None:
     table = pd.concat([own.iloc[1:], own.iloc[5:6], own.iloc[:1].assign(trial="nobody")])
-    path = tmp_path / "wrong.csv"
+    table["gross_spikes"] = table["gross_spikes"].where(table.index != 3, -1)
+    path = tmp_path / "wrong.CSV"
     table.to_csv(path, index=False)
     done = here("evaluate", store.folder, "--predictions", path)
     assert done.returncode == 2
     said = " ".join(done.stderr.split())
-    for words in ("nobody: no labelled", "missing: 1 window", "more than once"):
+    faults = ("nobody: no labelled", "missing: 1 window", "more than once", "must be whole numbers")
+    for words in faults:
         assert words in said
     for words, options in {
         "cannot be read": ("--predictions", tmp_path / "none.csv"),

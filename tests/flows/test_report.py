@@ -543,6 +543,8 @@ def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
     text = (store.folder / "report" / "against.html").read_text()
     assert "Both reports are simulated." in text
     assert "Protocols, settings, seeds and versions are the same." in text
+    page = sliplab.open_store(store.folder).report(against=other)
+    assert page == store.folder / "report" / "against.html"
     done = here("report", store.folder, "--against", store.folder)
     assert done.returncode == 0
     assert "Two reports (simulated)" in done.stdout

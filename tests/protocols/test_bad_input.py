@@ -28,6 +28,8 @@ SPED = "{every: 5, condition: {depth: 2, speed: 1, direction: 0, sped: 1}}"
 CASES = {
     "collection": f"""
         repetition: 2 | | did you mean 'repetitions'
+        epochs: 3 | | its place may be analysis.training.epochs
+        title: x | | its place may be the top level (title)
         repetitions: 50000 | ^factors | more than 1,000,000
         limits: | | is missing
         limits.duration: 10 s | | raise the limit

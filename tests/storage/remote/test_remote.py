@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Barrier, Event
 from typing import Any
 from uuid import uuid4
 
@@ -32,7 +34,7 @@ from sliplab.storage.remote.pull import ORIGIN, pull
 from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.catalogue import catalogue
-from sliplab.storage.trials.checksums import Checksum
+from sliplab.storage.trials.checksums import CHECKSUMS, DATA, Checksum
 from sliplab.storage.trials.control import again
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
@@ -144,11 +146,10 @@ def test_a_pull_that_was_cut_goes_on(
     store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push(store, remote)
-    get, count = Remote.get, [0]
+    get, count = Remote.get, itertools.count(1)
 
-    def failing(self: Remote, key: str, path: Path, known: Checksum) -> None:
-        count[0] += 1
-        if count[0] > 7:
+    def failing(self: Remote, key: str, path: Path, known: Checksum, stop: Event) -> None:
+        if next(count) > 7:
             raise KeyboardInterrupt
         get(self, key, path, known)
 
@@ -160,6 +161,35 @@ def test_a_pull_that_was_cut_goes_on(
     assert the(back).committed() == {TRIALS[0]}
     assert pull(remote, tmp_path / "back").files == 3 * 5 - 7
     assert tree(back.folder, "campaigns") == tree(store.folder, "campaigns")
+
+
+def test_files_of_a_trial_come_side_by_side_and_one_fault_stops_the_others(
+    store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push(store, remote)
+    get, together = Remote.get, Barrier(2)
+    stopped: list[str] = []
+
+    def failing(self: Remote, key: str, path: Path, known: Checksum, stop: Event) -> None:
+        if path.name in {CHECKSUMS, DATA}:
+            together.wait(timeout=30)  # raises where they do not come side by side
+        if path.name == CHECKSUMS:
+            raise RemoteError(f"{key}: the line is cut")
+        assert stop.wait(timeout=30)
+        try:
+            get(self, key, path, known, stop)
+        except RemoteError as error:
+            stopped.append(str(error))
+            raise
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Remote, "get", failing)
+        done = pull(remote, tmp_path / "back")
+    assert [problem.endswith("the line is cut") for problem in done.problems] == [True] * 3
+    assert stopped
+    assert all(text.endswith("was stopped") for text in stopped)
+    assert pull(remote, tmp_path / "back").pulled == len(TRIALS)
+    assert tree(tmp_path / "back", "campaigns") == tree(store.folder, "campaigns")
 
 
 def test_a_damaged_object_is_named_and_sent_anew(store: Store, remote: Any, tmp_path: Path) -> None:
