@@ -108,7 +108,7 @@ class Store:
         from sliplab.storage.trials.catalogue import catalogue, query
 
         table = catalogue(self._store)
-        return table if where is None else query(table, where, "where")
+        return table if where is None else query(table, where)
 
     def trial(self, trial_id: str, campaign: str | None = None) -> Trial:
         """One trial.

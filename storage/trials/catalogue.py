@@ -84,7 +84,7 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     return _rebuilt(store, parts, known, began_ns)
 
 
-def query(table: pd.DataFrame, expression: str, argument: str) -> pd.DataFrame:
+def query(table: pd.DataFrame, expression: str, argument: str = "where") -> pd.DataFrame:
     """Return the rows for which a pandas expression holds.
 
     Args:
