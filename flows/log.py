@@ -42,9 +42,9 @@ class LogEntry:
     Attributes:
         when: UTC, ISO 8601, to a second.
         who: the person, or the program's user; empty where it is not known.
-        what: ``note``, ``context``, ``run``, ``session``, ``quarantine``, ``register``, a request (``pause``,
-            ``resume``, ``stop``, ``skip``, ``again``) or a decision about a label (``accept``,
-            ``adjust``, ``reject``, ``reopen``).
+        what: ``note``, ``context``, ``run``, ``session``, ``quarantine``, ``register``, a request
+            (``pause``, ``resume``, ``stop``, ``skip``, ``again``) or a decision about a label
+            (``accept``, ``adjust``, ``reject``, ``reopen``).
         text: the note, the reason or the cause.
         campaign, trials: what it is about; empty for the whole store.
     """

@@ -58,9 +58,9 @@ UNREAD = "unread_bytes"
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
     """One row a committed trial: campaign, id, condition and context, counts, quality.
 
-    Conditions and context become columns by factor; levels with a unit are numbers, the unit is in the
-    column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since the
-    catalogue was last read are not read again.
+    Conditions and context become columns by name; levels with a unit are numbers, the unit is in
+    the column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since
+    the catalogue was last read are not read again.
 
     Args:
         unreadable: gets a line for every trial that is damaged; without it, one is an error.
