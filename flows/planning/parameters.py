@@ -6,11 +6,14 @@ what only they have (`flows.server.schedules`).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
 from sliplab.protocols.yaml_file import StrictModel
+
+Period = Literal["week", "month"]
+"""Of a report: the last 7 days, or the last month."""
 
 
 class TrialChoice(StrictModel):
