@@ -171,6 +171,9 @@ class RigFile(StrictModel):
     """Safe state of reflexes; left out, a failure stops the arm and moves it clear, as in any
     trial."""
 
+    alerts: dict[str, Any] | Literal["****"] | None = None
+    """To whom messages about the campaigns go (docs/alerts.md); masked in a store's copy."""
+
     @field_validator("cameras")
     @classmethod
     def _one_at_least(cls, cameras: tuple[str, ...]) -> tuple[str, ...]:

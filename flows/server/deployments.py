@@ -324,7 +324,7 @@ def _push(wanted: ScheduledPush, here: Service, run: Any) -> str:
     done = push(store, Remote(url), chosen, options, on_bytes=lambda _: stopping.check())
     if done.problems:
         raise StoreError(f"{url}: {len(done.problems)} not sent; first: {done.problems[0]}")
-    return f"push: {done.pushed} trials sent, {done.there} were there"
+    return f"push: {plural(done.pushed, 'trial')} sent, {done.there} were there"
 
 
 def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:

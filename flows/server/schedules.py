@@ -315,12 +315,12 @@ def load_schedules(path: Path) -> list[Scheduled]:
 
 
 def has_alerts(path: Path) -> bool:
-    """Return whether a file of schedules has the section ``alerts:``.
+    """Return whether a file of schedules, or a rig file, has the section ``alerts:``.
 
     Raises:
         InputError: it is not YAML.
     """
-    return parse_yaml(read_text(path, "schedule file"), path).get("alerts") is not None
+    return parse_yaml(read_text(path, "file"), path).get("alerts") is not None
 
 
 def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:

@@ -100,4 +100,5 @@ def service() -> Service:
     if text is None:
         raise RuntimeError("this flow runs only under `sliplab serve`")
     given = json.loads(text)
-    return Service(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+    lists = {name: tuple(given[name]) for name in ("protocols", "urls")}
+    return Service(**{**given, **lists})
