@@ -10,7 +10,7 @@ from pathlib import Path
 from sliplab.protocols import Plan
 from sliplab.protocols.shown import plural
 from sliplab.rigs.core.calibration import COMMANDS, ON_THE_SKIN, measured_on
-from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.context import ContextChange
 from sliplab.storage.trials.derived import Derived
@@ -39,29 +39,31 @@ def to_repeat(
     plan: Plan,
     change: ContextChange,
     skins: Mapping[str, str | None],
+    rig: RigFile | None = None,
 ) -> list[RepeatItem]:
     """Return what is still to be done since a skin was logged, in the order in which to do it.
 
     Args:
         change: by which the skin was logged.
         skins: of the committed trials, by id.
+        rig: the rig file as it is now; by default that of the last session.
 
     Raises:
         InputError: the campaign's copy of its rig file cannot be read.
     """
     skin, since = change.context["skin"], datetime.fromisoformat(change.when).astimezone()
+    rig = rig or load_rig_file(campaign.folder / "rig.yaml", stored=True)[0]
     new = {trial for trial, found in skins.items() if found == skin}
     return [
-        *_at_the_rig(store, campaign, plan, skin, since, begun=bool(new)),
+        *_at_the_rig(store, rig, plan, skin, since, begun=bool(new)),
         *_references(plan, new),
         *_results(store, campaign, since, new),
     ]
 
 
 def _at_the_rig(
-    store: Store, campaign: Campaign, plan: Plan, skin: str, since: datetime, *, begun: bool
+    store: Store, rig: RigFile, plan: Plan, skin: str, since: datetime, *, begun: bool
 ) -> Iterator[RepeatItem]:
-    rig, _ = load_rig_file(campaign.folder / "rig.yaml", stored=True)
     if rig.skin.serial != skin and not rig.simulated:
         yield RepeatItem(f"rig file: skin.serial: {skin}, and skin.made")
     for name in ON_THE_SKIN:

@@ -16,6 +16,7 @@ from sliplab.analysis.report.skins import skin_section
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.log import add_note, log_entries
+from sliplab.flows.planning import preflight
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.status import StatusReader
@@ -139,6 +140,15 @@ def test_one_list_names_what_belongs_to_the_old_skin(tmp_path: Path) -> None:
     ]
     assert "teach zero --rig RIG" in texts[0]
     assert "old" in texts[3]
+
+
+def test_a_check_names_what_the_new_skin_lacks(two_skins: tuple[Store, Campaign]) -> None:
+    store, _ = two_skins
+    folder = store.folder.parent
+    found = preflight.check(folder / "p.yaml", folder / "rig.yaml", store.folder, ())
+    (item,) = (each for each in found if each.name == "skin")
+    assert (item.passed, item.caution) == (True, True)
+    assert item.finding.startswith("labels of 2 trials")
 
 
 def test_references_are_compared_within_a_skin(
