@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.adapter import CLASSES, load_adapter
 from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural
 from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.split import held_out_part
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import (
     ADAPTER,
@@ -113,9 +114,16 @@ class Collected:
 
     @cached_property
     def trials(self) -> list[tuple[Trial, Recording]]:
-        """Committed trials of the plan, in the plan's order."""
+        """Committed trials of the plan, in the plan's order; the split holds out logged values."""
         there = self.campaign.committed()
-        return [(t, self.campaign.recording(t.id)) for t in self.planned if t.id in there]
+        found = [(t, self.campaign.recording(t.id)) for t in self.planned if t.id in there]
+        split = self.settings.split
+        if not split.held_out:
+            return found
+        return [
+            (replace(t, split=held_out_part(split, recording.context, t.split)), recording)
+            for t, recording in found
+        ]
 
     def need(self, stream: str, use: str) -> None:
         """See that trials were recorded with a stream.

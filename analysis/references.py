@@ -1,4 +1,4 @@
-"""Drift of a campaign's reference trials: each is compared with the first one.
+"""Drift of a campaign's reference trials: each is compared with the first one of its skin.
 
 Compared are the event rate in the hold and, on a rig with a force sensor, the friction in the
 slide. Onsets are not: they are unknown until `sliplab label` has read the outside camera's frames.
@@ -6,12 +6,14 @@ slide. Onsets are not: they are unknown until `sliplab label` has read the outsi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sliplab.analysis.force import sliding_friction
 from sliplab.analysis.quality import hold_rate
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.gates import ReferenceGate
+from sliplab.storage.trials.context import SKIN
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign
 
@@ -60,6 +62,13 @@ def reference_trials(plan: Plan, committed: set[str]) -> list[Trial]:
     return [trial for trial in plan if trial.role == "reference" and trial.id in committed]
 
 
+def of_skin(campaign: Campaign, trials: Sequence[Trial], skin: str | None) -> list[Trial]:
+    """Return the trials that were taken with a skin; None for that of the last trial."""
+    skins = [campaign.recording(trial.id).context.get(SKIN) for trial in trials]
+    wanted = skin if skin is not None or not skins else skins[-1]
+    return [trial for trial, found in zip(trials, skins, strict=True) if found == wanted]
+
+
 def compare(
     gate: ReferenceGate,
     first: tuple[str, dict[str, float]],
@@ -74,10 +83,16 @@ def compare(
 
 
 def last_drift(plan: Plan, campaign: Campaign, committed: set[str]) -> list[ReferenceDrift]:
-    """Compare the last committed reference trial with the first; nothing without two or a gate."""
+    """Compare the last committed reference trial with the first of its skin.
+
+    Returns:
+        Nothing without two of them, or a gate.
+    """
     gate = plan.protocol.collection.gates.reference
-    known = reference_trials(plan, committed)
-    if gate is None or len(known) < 2:
+    if gate is None:
+        return []
+    known = of_skin(campaign, reference_trials(plan, committed), None)
+    if len(known) < 2:
         return []
     first, last = (
         (trial.id, reference_figures(campaign.recording(trial.id), gate))

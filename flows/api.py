@@ -8,7 +8,7 @@ command prints with ``--json``; a failed check is in the result, not an exceptio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -336,10 +336,35 @@ class Store:
 
         return StatusReader(self._store).read()
 
-    def log(self) -> list[LogEntry]:
-        """What people and programs did to the store, oldest first; damaged files are left out."""
-        from sliplab.flows.log import log_entries
+    def log(
+        self,
+        text: str = "",
+        *,
+        skin: str | None = None,
+        context: Mapping[str, str] | None = None,
+        campaigns: Sequence[str] | None = None,
+        who: str = "",
+    ) -> list[LogEntry]:
+        """What people and programs did to the store, oldest first; damaged files are left out.
 
+        With arguments, an entry is added first. A skin or other context is stored with every trial
+        from then on; `status` lists what a new skin asks for.
+
+        Args:
+            text: a note.
+            skin: serial number of a skin that was mounted.
+            context: other values by name: ``{"temperature": "24 degC"}``.
+            campaigns: those that `skin` and `context` are about; all that have begun by default.
+            who: empty for the user that is logged in.
+
+        Raises:
+            ValueError: an argument is wrong. InputError: a campaign's protocol plans the value.
+        """
+        from sliplab.flows.log import add_note, log_entries
+
+        values = {**(context or {}), **({} if skin is None else {"skin": skin})}
+        if text or values:
+            add_note(self._store, text, who=who, context=values, campaigns=campaigns)
         return log_entries(self._store)
 
     def note(self, text: str, *, who: str = "") -> LogEntry:

@@ -1,6 +1,6 @@
 """The log of a store: what people and programs did to it, in the order of time.
 
-    STORE/log/000001.json   a note: who, when, text
+    STORE/log/000001.json   a note: who, when, text; maybe a change (`storage.trials.context`)
 
 Everything else is read from where it is used: requests and their answers
 (`storage.trials.control`), flow runs (`flows.running.run_records`), sessions at the rig, attempts
@@ -10,24 +10,27 @@ written twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import run_records
 from sliplab.flows.running.console import duration
-from sliplab.protocols.errors import InputError
+from sliplab.protocols import InputError, Plan
+from sliplab.protocols.quantity import canonical, parse
+from sliplab.protocols.shown import CONTROL, did_you_mean
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import inside, read_json
+from sliplab.storage.files import read_json
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control, review
 from sliplab.storage.trials.checksums import PROVENANCE
-from sliplab.storage.trials.journal import Journal, signature
+from sliplab.storage.trials.context import check_values, log_journal, planned_names
+from sliplab.storage.trials.journal import signature
 from sliplab.storage.trials.registration import registrations
-from sliplab.storage.trials.store import AGAIN, CAUSE, Campaign, Store
+from sliplab.storage.trials.store import AGAIN, CAUSE, IMPORTED, Campaign, Store
 
-FOLDER = "log"
 MOST_CHARACTERS = 10_000
 """Length of a note."""
 
@@ -39,9 +42,9 @@ class LogEntry:
     Attributes:
         when: UTC, ISO 8601, to a second.
         who: the person, or the program's user; empty where it is not known.
-        what: ``note``, ``run``, ``session``, ``quarantine``, ``register``, a request (``pause``,
-            ``resume``, ``stop``, ``skip``, ``again``) or a decision about a label (``accept``,
-            ``adjust``, ``reject``, ``reopen``).
+        what: ``note``, ``context``, ``run``, ``session``, ``quarantine``, ``register``, a request
+            (``pause``, ``resume``, ``stop``, ``skip``, ``again``) or a decision about a label
+            (``accept``, ``adjust``, ``reject``, ``reopen``).
         text: the note, the reason or the cause.
         campaign, trials: what it is about; empty for the whole store.
     """
@@ -54,26 +57,111 @@ class LogEntry:
     trials: tuple[str, ...] = ()
 
 
-def add_note(store: Store, text: str, *, who: str = "", argument: str = "text") -> LogEntry:
-    """Add a note to the log. It may be added while trials are taken: no lock is needed.
+def add_note(
+    store: Store,
+    text: str = "",
+    *,
+    who: str = "",
+    context: Mapping[str, str] | None = None,
+    campaigns: Sequence[str] | None = None,
+    argument: str = "text",
+) -> LogEntry:
+    """Add a note to the log, or a change of context that is stored with every trial from then on.
+
+    It may be added while trials are taken: no lock is needed, and the next trial has it.
 
     Args:
         who: empty for the user that is logged in.
+        context: new values by name: ``{"skin": "0043", "temperature": "24 degC"}``.
+        campaigns: those that the change is about; all that have begun by default.
         argument: that gave the text.
 
     Raises:
-        InputError: the text is empty or too long.
+        InputError: text, `who` or a value is wrong, a campaign is unknown, or its protocol plans
+            what was logged.
         OSError: it cannot be written.
     """
     text = text.strip()
-    if not text:
+    for name, value in ((argument, text), ("who", who)):
+        if "\n" in value or "\t" in value or CONTROL.search(value):
+            raise InputError(name, "", value, "must be one line without control characters")
+    if not text and not context:
         raise InputError(argument, "", text, "must not be empty")
     if len(text) > MOST_CHARACTERS:
         fault = f"has {len(text)} characters: must have {MOST_CHARACTERS} at most"
         raise InputError(argument, "", text, fault)
     signed = signature(who, "")
-    Journal(inside(store.folder / FOLDER, store.folder)).append({**signed, "text": text})
-    return LogEntry(when=signed["when"], who=signed["who"], what="note", text=text)
+    entry: Json = {**signed, "text": text}
+    if context:
+        check_values(context)
+        found = _begun(store, campaigns)
+        made = dict(context)
+        for campaign in found:
+            made = _in_units(made, Collected(campaign).plan, campaign.name)
+        entry |= {"context": made, "campaigns": [campaign.name for campaign in found]}
+    log_journal(store).append(entry)
+    return _entry(entry)
+
+
+def _begun(store: Store, names: Sequence[str] | None) -> list[Campaign]:
+    """Return the campaigns that a change is about."""
+    there = {item.name: item for item in store.campaigns() if IMPORTED not in item.info}
+    for name in names or ():
+        if name not in there:
+            text = f"is no campaign that was collected here; there are {', '.join(there) or 'none'}"
+            raise InputError("--campaign", "", name, text + did_you_mean(name, there))
+    if not there:
+        raise InputError(
+            store.folder,
+            "",
+            None,
+            "no campaign has begun in this store: write the skin into the rig file "
+            "(`skin.serial`), other values below `collection.context` of the protocol",
+        )
+    return [there[name] for name in (names or there)]
+
+
+def _in_units(context: Mapping[str, str], plan: Plan, campaign: str) -> dict[str, str]:
+    """Return the values in the units of a campaign's protocol.
+
+    Raises:
+        InputError: the protocol plans one of them trial by trial.
+    """
+    collection, made = plan.protocol.collection, dict(context)
+    for name, value in context.items():
+        if name not in collection.all_factors:
+            continue
+        if name in planned_names(plan):
+            text = (
+                f"is planned trial by trial by {collection.key_of(name)} of campaign {campaign}; "
+                "log it for others with --campaign, or add a level to that protocol"
+            )
+            raise InputError("--context", name, value, text)
+        unit = collection.all_factors[name].unit
+        if unit is not None:
+            try:
+                made[name] = f"{canonical(parse(value, unit))} {unit}"
+            except ValueError as error:
+                raise InputError("--context", name, value, str(error)) from None
+        elif " " in value:
+            text = f"must be a name without a unit, as in campaign {campaign}"
+            raise InputError("--context", name, value, text)
+    return made
+
+
+def _entry(data: Json) -> LogEntry:
+    """Return a note or a change as an entry of the log."""
+    context = data.get("context")
+    context = context if isinstance(context, dict) else {}
+    parts = [f"{name} {value}" for name, value in context.items()]
+    parts += [str(data["text"])] if data.get("text") else []
+    return LogEntry(
+        when=data["when"],
+        who=str(data.get("who", "")),
+        what="context" if context else "note",
+        text=", ".join(parts),
+        campaign=", ".join(data.get("campaigns") or ()),
+    )
 
 
 def log_entries(store: Store, unreadable: list[str] | None = None) -> list[LogEntry]:
@@ -93,12 +181,11 @@ def log_entries(store: Store, unreadable: list[str] | None = None) -> list[LogEn
 
 
 def _notes(store: Store, faults: list[str]) -> Iterator[LogEntry]:
-    journal = Journal(inside(store.folder / FOLDER, store.folder))
+    journal = log_journal(store)
     for number in journal.numbers():
         data = _read(journal.path(number), "when", faults)
         if data is not None:
-            text = str(data.get("text", ""))
-            yield LogEntry(when=data["when"], who=str(data.get("who", "")), what="note", text=text)
+            yield _entry(data)
 
 
 def _requests(store: Store) -> Iterator[LogEntry]:

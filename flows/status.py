@@ -21,12 +21,14 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.references import last_drift
 from sliplab.flows.planning.campaign_trials import ExcludedTrial, excluded_trials
 from sliplab.flows.planning.disk_space import RESERVE
+from sliplab.flows.skin_change import to_repeat
 from sliplab.protocols import InputError, Plan
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.process import named
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE, incomplete
+from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
 from sliplab.storage.trials.store import IMPORTED, Campaign, Store
 
@@ -95,6 +97,9 @@ class CampaignStatus:
         bytes_per_trial: median on disk; None without a trial.
         nights_of_disk: nights until the disk is full, at the pace so far.
         drift: of the last reference trial.
+        context: what people logged of skin, temperature and so on, by name.
+        skins: committed trials by skin.
+        repeat: what is still to be done since another skin was logged, in order.
         problem: why the campaign could not be read; all else is empty then.
     """
 
@@ -112,6 +117,9 @@ class CampaignStatus:
     bytes_per_trial: int | None = None
     nights_of_disk: float | None = None
     drift: list[DriftStatus] = field(default_factory=list)
+    context: dict[str, str] = field(default_factory=dict)
+    skins: dict[str, int] = field(default_factory=dict)
+    repeat: list[str] = field(default_factory=list)
     problem: str | None = None
 
 
@@ -140,9 +148,10 @@ class StoreStatus:
 
 @dataclass(frozen=True)
 class _TrialFolder:
-    """When a committed trial ended, if that is known, and its bytes on disk."""
+    """When a committed trial ended and with which skin, if that is known; its bytes on disk."""
 
     ended: datetime | None
+    skin: str | None
     bytes: int
 
 
@@ -154,6 +163,7 @@ class StatusReader:
         self._known: dict[tuple[Path, int], _TrialFolder] = {}
         self._drift: dict[tuple[str, ...], list[DriftStatus]] = {}
         self._plans: dict[tuple[Path, int], Plan] = {}
+        self._logged: dict[str, LoggedContext] = {}
 
     def read(self, now: datetime | None = None) -> StoreStatus:
         """Return the state.
@@ -209,6 +219,13 @@ class StatusReader:
             pace = pace_of(plan, ended)
             left = sum(plan.seconds(trial) for trial in missing)
             a_night = mean(over or nights) if nights else 0.0
+            logged = self._logged.setdefault(
+                campaign.name, LoggedContext(self._store, campaign.name)
+            )
+            context = unplanned(logged.read(), plan)
+            skins = {trial.id: folders[trial.id].skin for trial in done}
+            change = logged.last() if SKIN in context else None
+            repeat = [] if change is None else to_repeat(self._store, campaign, plan, change, skins)
             return CampaignStatus(
                 campaign=campaign.name,
                 simulated=simulated,
@@ -224,6 +241,9 @@ class StatusReader:
                 bytes_per_trial=size,
                 nights_of_disk=free / (size * a_night) if size and a_night else None,
                 drift=self._drifts(plan, campaign, committed),
+                context=context,
+                skins=dict(Counter(skin for skin in skins.values() if skin)),
+                repeat=[str(item) for item in repeat],
             )
         except (InputError, StoreError) as error:
             return CampaignStatus(campaign.name, simulated, problem=str(error))
@@ -244,7 +264,7 @@ class StatusReader:
             key = path, path.stat().st_ino  # a trial that is taken again is another folder
             if key not in self._known and incomplete(path) is None:
                 size = sum(each.stat().st_size for each in path.iterdir() if each.is_file())
-                self._known[key] = _TrialFolder(_moment(path / PROVENANCE), size)
+                self._known[key] = _TrialFolder(*_provenance(path / PROVENANCE), size)
             if key in self._known:
                 found[path.name] = self._known[key]
         return found
@@ -335,11 +355,13 @@ def _nights_left(
     return NightsLeft(expected, low, high, ends(low or expected), ends(high or expected))
 
 
-def _moment(path: Path) -> datetime | None:
+def _provenance(path: Path) -> tuple[datetime | None, str | None]:
+    """Return when a trial ended, and with which skin it was taken."""
     try:
-        return datetime.fromisoformat(str(read_json(path)["ended"]))
+        found = read_json(path)
+        return datetime.fromisoformat(str(found["ended"])), found.get("skin")
     except (OSError, ValueError, KeyError):
-        return None
+        return None, None
 
 
 def _utc(moment: datetime) -> str:

@@ -23,6 +23,7 @@ from sliplab.protocols.yaml_file import StrictModel, rule
 
 GOLDEN = 0.6180339887498949
 _SCALE = float(1 << 63)
+PARTS = ("train", "validation", "test")
 
 HeldOut = Annotated[str, WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}]})]
 """A level; a number without a unit is in its factor's, see `protocols.model`."""
@@ -42,6 +43,11 @@ class Split(StrictModel):
     strata: tuple[str, ...] = ("depth", "speed")
     validation_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
     test_levels: dict[str, tuple[HeldOut, ...]] = Field(default_factory=dict)
+    held_out: dict[str, tuple[str, ...]] = Field(
+        default_factory=dict, exclude_if=lambda held: not held
+    )
+    """Values that people logged, such as a skin's serial number: trials with one of them are test
+    trials, and no others are. Settings without any stay what they were, with their hash."""
 
     @rule
     def _sums(self) -> Split:
@@ -54,6 +60,19 @@ class Split(StrictModel):
         if self.method == "leave_conditions_out" and not self.test_levels:
             raise KeyedError("analysis.split.test_levels", {}, "must list the held-out levels")
         return self
+
+
+def held_out_part(split: Split, context: Mapping[str, str], planned: str) -> str:
+    """Return the part of a trial, by the context that it was taken in.
+
+    Args:
+        planned: its part by its condition alone.
+    """
+    if not split.held_out or planned not in PARTS:
+        return planned
+    if any(context.get(name) in values for name, values in split.held_out.items()):
+        return "test"
+    return "train" if planned == "test" else planned
 
 
 def assign(

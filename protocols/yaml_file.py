@@ -447,6 +447,11 @@ def parse_leniently(text: str, path: str | Path) -> YamlDocument:
     return YamlDocument(data, builder.written, builder.faults)
 
 
+def _withheld(key: str) -> bool:
+    """Return whether a key's value stays out of copies: a secret, or addresses with secrets."""
+    return is_secret(key) or key == "alerts"
+
+
 def mask_secrets(text: str) -> str:
     """YAML text with the values of secret keys masked, at any depth; the rest stays unchanged."""
     found = sorted(_secret_values(_composed(text)), key=lambda node: -node.start_mark.index)
@@ -460,7 +465,7 @@ def mask_secrets(text: str) -> str:
 def _secret_values(node: Any) -> Iterator[Any]:
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     for key, value in pairs:
-        if isinstance(key.value, str) and is_secret(key.value):
+        if isinstance(key.value, str) and _withheld(key.value):
             if value.value not in ("", MASK):
                 yield value
         else:
@@ -472,7 +477,7 @@ def _secret_values(node: Any) -> Iterator[Any]:
 def without_secrets(data: Any) -> Any:
     """Plain data without the keys that hold secrets, at any depth."""
     if isinstance(data, dict):
-        return {key: without_secrets(part) for key, part in data.items() if not is_secret(key)}
+        return {key: without_secrets(part) for key, part in data.items() if not _withheld(key)}
     return [without_secrets(part) for part in data] if isinstance(data, list) else data
 
 

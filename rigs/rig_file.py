@@ -34,7 +34,7 @@ from sliplab.protocols.yaml_file import (
     without_secrets,
 )
 from sliplab.rigs.core.arm_settings import check_units
-from sliplab.rigs.core.calibration import Calibration, without_taught
+from sliplab.rigs.core.calibration import Calibration, without_skin, without_taught
 from sliplab.rigs.core.driver import Driver, RigDriver
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.core.registry import find_driver
@@ -170,6 +170,9 @@ class RigFile(StrictModel):
     reflex: ReflexSettings | None = None
     """Safe state of reflexes; left out, a failure stops the arm and moves it clear, as in any
     trial."""
+
+    alerts: dict[str, Any] | Literal["****"] | None = None
+    """To whom messages about the campaigns go (docs/alerts.md); masked in a store's copy."""
 
     @field_validator("cameras")
     @classmethod
@@ -381,16 +384,24 @@ def rig_hash(text: str) -> str:
     return hash_text(mask_secrets(text))
 
 
-def same_rig(one: str, other: str) -> bool:
+def same_rig(one: str, other: str, *, skin: str | None = None) -> bool:
     """Return whether the contents of two rig files describe the same rig.
 
     A key that has its default value may as well be left out. The simulated faults are ignored: a
     campaign that a fault ended continues without it. The plate's taught position and passwords are
     ignored too.
+
+    Args:
+        skin: serial number of another skin that was mounted. The second may name it, and what was
+            measured on it.
     """
     if one == other:
         return True
     first, second = (parse_yaml(text, "rig.yaml") for text in (one, other))
+    if skin is not None:
+        before, now = (data["skin"].get("serial") for data in (first, second))
+        if now in (before, skin):
+            first, second = without_skin(first), without_skin(second)
     if _lasting(first) == _lasting(second):
         return True
     try:

@@ -33,6 +33,7 @@ from sliplab.analysis.report.page import (
 )
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
 from sliplab.analysis.report.registration import registration_key, registration_section
+from sliplab.analysis.report.skins import skin_section
 from sliplab.analysis.report.sources import VERSION, report_key
 from sliplab.analysis.report.summary import (
     label_sources,
@@ -247,6 +248,7 @@ def one_camera_sections(
         registration_section(store, campaigns),
         *plugin_sections(ReportData(store, campaigns, simulated, summary)),
         quality_section(campaigns, summary.references, simulated=simulated),
+        skin_section(campaigns),
     ]
     if judged is not None:
         sections += marker_sections(store, campaigns, summary, judged)

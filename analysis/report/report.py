@@ -33,6 +33,7 @@ from sliplab.analysis.report.paper import paper_section
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections
 from sliplab.analysis.report.programs import HOLDOUT
 from sliplab.analysis.report.registration import registration_section
+from sliplab.analysis.report.skins import skin_section
 from sliplab.analysis.report.sources import Sources
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
@@ -135,6 +136,7 @@ def make_sections(sources: Sources, summary: Summary, shown: ReportMaterial) -> 
         registration_section(store, list(campaigns)),
         *plugin_sections(data),
         quality_section(campaigns, summary.references, simulated=simulated),
+        skin_section(campaigns, rows),
         trial,
         force_section(store, campaigns, seen, simulated=simulated),
         windows.network_section(kinematic, shown.fitted, simulated=simulated),

@@ -219,7 +219,8 @@ def serve(
     from sliplab.rigs.rig_inheritance import rig_path
 
     found = [] if schedules is None else load_schedules(schedules)
-    alerts = schedules if schedules is not None and has_alerts(schedules) else None
+    files = [file for file in (schedules, rig_path(rig)) if file is not None]
+    alerts = next(filter(has_alerts, files), None)
     if alerts is not None:
         plugins().hook("check_alerts")(alerts)
     file, _ = load_rig_file(rig)

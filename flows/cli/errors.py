@@ -55,6 +55,11 @@ _WITH_TRIALS = {
     "reflex",
 }
 """Commands that take trials or process them, and resume."""
+_WATCHING = {
+    "status": "interrupted: no longer watching",
+    "alerts": "interrupted: no longer watching; what waits is sent when alerts run again",
+}
+"""What is said at the end of commands that only watch."""
 _EXPECTED = {
     "RigError",
     "ArmFault",
@@ -115,9 +120,11 @@ class Failure:
 
 def interruption() -> Failure:
     """Return the failure of a program that the user stopped."""
+    command = _command().removeprefix("sliplab ")
     text = "interrupted: nothing is left half-written; run the same command again"
-    if _command().removeprefix("sliplab ") in _WITH_TRIALS:
+    if command in _WITH_TRIALS:
         text = _RESUMABLE
+    text = _WATCHING.get(command, text)
     return Failure(text, exit_codes.INTERRUPTED)
 
 

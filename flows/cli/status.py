@@ -6,13 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import COLLECT, JsonOption, StoreArgument
+from sliplab.flows.cli.common import COLLECT, CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from datetime import datetime
 
     from sliplab.flows.status import CampaignStatus, StoreStatus
+    from sliplab.storage.trials.store import Store
 
 app = typer.Typer()
 
@@ -33,7 +35,6 @@ def status(
     """Show who collects, how far each campaign is, when it ends, and what needs a person."""
     from sliplab.flows.running import stopping
     from sliplab.flows.status import StatusReader
-    from sliplab.protocols.errors import InputError
     from sliplab.storage.trials.store import Store
 
     if watch and as_json:
@@ -52,31 +53,46 @@ def status(
 
 
 @app.command(
-    rich_help_panel=COLLECT, epilog='Example: sliplab log my-store "new skin, lens cleaned"'
+    rich_help_panel=COLLECT, epilog='Example: sliplab log my-store "lens cleaned" --skin 0043'
 )
 def log(
     store: StoreArgument,
     text: Annotated[
         str | None, typer.Argument(help="A note to add; without it, the log is printed.")
     ] = None,
-    who: Annotated[str, typer.Option("--who", help="Your name; default: the login name.")] = "",
+    skin: Annotated[
+        str | None, typer.Option("--skin", help="Serial number of a skin that was mounted.")
+    ] = None,
+    context: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--context", help="Another value from now on: temperature='24 degC'. Repeatable."
+        ),
+    ] = None,
+    campaign: CampaignOption = None,
+    who: Annotated[
+        str | None, typer.Option("--who", help="Your name; default: the login name.")
+    ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help=f"Print all entries, not only the last {LINES}.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print who did what and when, or add a note. Notes may be added while trials are taken."""
-    from sliplab.flows.log import add_note, log_entries
+    """Print who did what and when; or add a note, or a skin or value that holds from now on.
+
+    Both may be added while trials are taken: every trial from the next one on is stored with them.
+    """
+    from sliplab.flows.log import log_entries
     from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
-    if text is not None:
-        entry = add_note(opened, text, who=who, argument="TEXT")
-        if as_json:
-            console.print_json(vars(entry))
-        else:
-            console.show(f"noted by {entry.who}, {_local(entry.when)}")
+    changed = {**_pairs(context or []), **({} if skin is None else {"skin": skin})}
+    if text is not None or changed:
+        _add(opened, text, changed, campaign, who, as_json)
         return
+    for option, value in (("--who", who), ("--campaign", campaign)):
+        if value is not None:
+            raise InputError(option, "", str(value), "needs a note, --skin or --context")
     unreadable: list[str] = []
     entries = log_entries(opened, unreadable)
     for problem in unreadable:
@@ -93,6 +109,50 @@ def log(
     console.print_table(f"log of {store}", columns, rows)
     if len(shown) < len(entries):
         console.say(f"the last {LINES} of {len(entries)} entries; --all prints them")
+
+
+def _pairs(texts: list[str]) -> dict[str, str]:
+    """Return NAME=VALUE options as a mapping. Raises InputError."""
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InputError("--context", "", text, "must be NAME=VALUE, such as operator=anna")
+        found[name.strip()] = value.strip()
+    return found
+
+
+def _add(
+    store: Store,
+    text: str | None,
+    context: dict[str, str],
+    campaigns: list[str] | None,
+    who: str | None,
+    as_json: bool,
+) -> None:
+    """Add a note or a change to the log, and print what a new skin asks for."""
+    from sliplab.flows.log import add_note
+    from sliplab.flows.status import StatusReader
+
+    if who is not None and not who.strip():
+        raise InputError("--who", "", who, "must be a name; leave it out for the login name")
+    if campaigns and not context:
+        raise InputError("--campaign", "", ", ".join(campaigns), "needs --skin or --context")
+    entry = add_note(
+        store, text or "", who=who or "", context=context, campaigns=campaigns, argument="TEXT"
+    )
+    repeat = {}
+    if "skin" in context:
+        found = StatusReader(store).read().campaigns
+        repeat = {each.campaign: each.repeat for each in found if each.repeat}
+    if as_json:
+        console.print_json({**vars(entry), "repeat": repeat})
+        return
+    console.show(f"{entry.text if context else 'noted'} by {entry.who}, {_local(entry.when)}")
+    for name, items in repeat.items():
+        console.show(f"{name}: to do before its next trial, or with it")
+        for item in items:
+            console.show(f"  - {item}")
 
 
 def _print(status: StoreStatus) -> None:
@@ -151,6 +211,11 @@ def _campaign_lines(item: CampaignStatus) -> list[str]:
             f"  drift     {drift.key} {change} since the first reference trial, "
             f"{drift.bound_percent:g} % allowed{over}"
         )
+    if item.context:
+        values = ", ".join(f"{name} {value}" for name, value in item.context.items())
+        taken = ", ".join(f"{plural(n, 'trial')} with {skin}" for skin, n in item.skins.items())
+        lines.append(f"  context   {values}{f' ({taken})' if taken else ''}")
+    lines += [f"  to do     {each}" for each in item.repeat]
     for trial in item.excluded:
         by = f"by {trial['by']}" if trial["by"] else f"after {plural(trial['attempts'], 'attempt')}"
         lines.append(f"  excluded  {trial['trial']} {by}: {trial['cause']}")

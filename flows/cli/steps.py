@@ -21,6 +21,7 @@ from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.planning.parameters import RuleOptions
 from sliplab.flows.running import console
 from sliplab.flows.steps import located, run_step
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
@@ -200,10 +201,26 @@ def report(
         Path | None,
         typer.Option("--against", help="Another store or its summary.json to compare with."),
     ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option("--since", help="Report what happened from this day on: 2026-11-22."),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", help="Its last day; default: the current one.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write report/index.html and report/summary.json, and compare with another report."""
+    """Write report/index.html and report/summary.json, and compare with another report.
+
+    With --since, write report/periods/ instead: trials, drift, forecasts and what people did.
+    """
     folder = located(store)
+    if since is not None or until is not None:
+        if campaign or against is not None:
+            option = "--against" if against is not None else "--campaign"
+            raise InputError(option, "", None, "cannot be combined with --since and --until")
+        _report_period(folder, since, until, as_json)
+        return
     if against is not None:
         from sliplab.analysis.report.against import load_report
 
@@ -223,3 +240,18 @@ def report(
             console.show(f"Page: {page}")
     finish(done, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")
+
+
+def _report_period(folder: Path, since: str | None, until: str | None, as_json: bool) -> None:
+    from datetime import datetime
+
+    from sliplab.flows.period import days, write_period_report
+    from sliplab.storage.files import read_json
+    from sliplab.storage.remote.mirror import open_store
+
+    now = datetime.now().astimezone()
+    page = write_period_report(open_store(folder), *days(since, until, now), now)
+    if as_json:
+        console.print_json({**read_json(page.with_suffix(".json")), "page": str(page)})
+    else:
+        console.show(f"Page: {page}")

@@ -12,9 +12,9 @@ from __future__ import annotations
 import platform
 import shutil
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from typing import Protocol
@@ -49,6 +49,7 @@ from sliplab.storage.schema.trial import (
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
+from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
 from sliplab.storage.trials.recovery import recover
 from sliplab.storage.trials.registration import registration_files
 from sliplab.storage.trials.store import Campaign, SessionRecord, Store
@@ -115,7 +116,8 @@ def open_session(
             _opened_rounds(run_request, store, campaign) as rounds,
         ):
             rig = build_rig(run_request.rig, stopping.requested)
-            campaign.add_bench_record(_session_record(run_request, campaign))
+            logged = LoggedContext(store, campaign.name)
+            campaign.add_bench_record(_session_record(run_request, campaign, logged.read()))
             collector = TrialCollector(
                 run_request.plan,
                 run_request.rig,
@@ -125,6 +127,7 @@ def open_session(
                 on_trial=listener.on_trial_done,
                 on_commit=_ignore if rounds is None else rounds.committed,
                 supervisor=supervisor,
+                context=logged.read,
             )
             try:
                 trials = run_request.due_trials(campaign)
@@ -182,10 +185,18 @@ def clean_up(store: Store) -> None:
                 sweep_temporary(path)
 
 
-def _session_record(run_request: RunRequest, campaign: Campaign) -> SessionRecord:
-    """Return the metadata of one session at the rig, as the store keeps it."""
+def _session_record(
+    run_request: RunRequest, campaign: Campaign, logged: Mapping[str, str]
+) -> SessionRecord:
+    """Return the metadata of one session at the rig, as the store keeps it.
+
+    Args:
+        logged: context that people logged; its skin comes before the rig file's.
+    """
     began = datetime.now(UTC)
     skin, metadata = run_request.rig.skin, run_request.metadata
+    serial = logged.get(SKIN, skin.serial)
+    made = skin.made if serial == skin.serial else None
     record: SessionRecord = {
         "began": began.isoformat(timespec="seconds"),
         "operator": metadata.operator,
@@ -194,9 +205,9 @@ def _session_record(run_request: RunRequest, campaign: Campaign) -> SessionRecor
         "note": metadata.note,
         "rig": run_request.rig.name,
         "sensor": run_request.rig.sensor,
-        "skin": skin.serial,
+        "skin": serial,
         "calibration": run_request.rig.calibration.model_dump(mode="json", exclude_none=True),
-        "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
+        "skin_age_days": None if made is None else (began.date() - made).days,
         "simulated": run_request.rig.simulated,
     }
     if registered := registration_files(campaign):
@@ -214,6 +225,7 @@ class TrialCollector:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
         on_commit: called after each trial that was committed.
         supervisor: asked before each attempt and notified after each trial, if there is one.
+        context: returns what people have logged by now of skin, temperature and so on, by name.
         taken, retaken: attempts so far, and those of them that repeat one.
     """
 
@@ -225,12 +237,15 @@ class TrialCollector:
     on_trial: Callable[[Trial, str], None] = NO_LISTENER.on_trial_done
     on_commit: Callable[[Trial], None] = _ignore
     supervisor: CollectionSupervisor | None = None
+    context: Callable[[], dict[str, str]] = dict
     taken: int = 0
     retaken: int = 0
     _previous: Trial | None = None
     _warm: bool = False
     _zero_slot: int | None = None
     _zero_sd_mm: float | None = None
+    _logged: dict[str, str] = field(default_factory=dict)
+    """Context of the attempt."""
 
     def take(self, trials: list[Trial]) -> None:
         """Take `trials`, and do before each what the protocol asks for.
@@ -254,10 +269,11 @@ class TrialCollector:
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
-        if self.supervisor is None:
-            return True
-        may = self.supervisor.may_take(trial)
-        if self.supervisor.was_paused():
+        may = self.supervisor is None or self.supervisor.may_take(trial)
+        if self.supervisor is not None and self.supervisor.was_paused():
+            self.fresh_start()
+        before, self._logged = self._logged, unplanned(self.context(), self.plan)
+        if before.get(SKIN) != self._logged.get(SKIN):
             self.fresh_start()
         if not may:
             self.on_trial(trial, "skipped")
@@ -403,7 +419,7 @@ class TrialCollector:
         found: Assessment,
         frame_px: tuple[int, int] | None,
     ) -> TrialRecord:
-        """Return the trial's record: all that follows from protocol, seed and versions."""
+        """Return the trial's record: what follows from protocol, seed, versions and the log."""
         recorded = run.recorded_ns
         first, last = run.steps[0][0], run.steps[-1][0]
         record = TrialRecord(
@@ -443,6 +459,7 @@ class TrialCollector:
             "devices": self.rig.describe(),
             "simulation_truth": run.truth,
             "streams": _with_press(found.streams, run.pressed_mm),
+            "context": self._logged,
         }
         return record.model_copy(update={name: value for name, value in known.items() if value})
 
@@ -472,7 +489,7 @@ class TrialCollector:
             ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
             host=socket.gethostname(),
             operator=self.operator,
-            skin=self.rig_file.skin.serial,
+            skin=self._logged.get(SKIN, self.rig_file.skin.serial),
             disk_free=shutil.disk_usage(self.campaign.folder).free,
             **_installed(),
         )

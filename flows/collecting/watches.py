@@ -9,6 +9,7 @@ from pathlib import Path
 from sliplab.analysis.references import (
     ReferenceDrift,
     compare,
+    of_skin,
     reference_figures,
     reference_trials,
 )
@@ -18,7 +19,8 @@ from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running.console import size
 from sliplab.protocols import Trial
-from sliplab.storage.trials.store import Campaign
+from sliplab.storage.trials.context import SKIN, LoggedContext
+from sliplab.storage.trials.store import Campaign, Store
 
 _LOOK_BACK = 50
 """Committed trials from which a session estimates sizes when it begins."""
@@ -90,12 +92,14 @@ class DiskWatch:
 
 
 class ReferenceWatch:
-    """Compares every reference trial with the campaign's first one, and stops at a large drift."""
+    """Compares every reference trial with the first of its skin, and stops at a large drift."""
 
     def __init__(self, run_request: RunRequest, campaign: Campaign) -> None:
         self._run_request, self._campaign = run_request, campaign
         self._gate = run_request.plan.protocol.collection.gates.reference
         self._first: tuple[str, dict[str, float]] | None = None
+        self._skin: str | None = None
+        """Of the first one."""
 
     def begin(self) -> None:
         """Check the last reference trial of earlier sessions.
@@ -105,7 +109,10 @@ class ReferenceWatch:
         """
         if self._gate is None:
             return
+        logged = LoggedContext(Store(self._run_request.store), self._campaign.name).read()
+        skin = logged.get(SKIN, self._run_request.rig.skin.serial)
         known = reference_trials(self._run_request.plan, self._campaign.committed())
+        known = of_skin(self._campaign, known, skin)
         for trial in dict.fromkeys([*known[:1], *known[-1:]]):
             self.look(trial)
 
@@ -117,8 +124,11 @@ class ReferenceWatch:
         """
         if self._gate is None or trial.role != "reference":
             return
-        found = trial.id, reference_figures(self._campaign.recording(trial.id), self._gate)
-        self._first = self._first or found
+        recording = self._campaign.recording(trial.id)
+        found = trial.id, reference_figures(recording, self._gate)
+        skin = recording.context.get(SKIN)
+        if self._first is None or skin != self._skin:
+            self._first, self._skin = found, skin
         for drift in compare(self._gate, self._first, found):
             if drift.beyond:
                 raise CampaignStopped(self._message(drift))

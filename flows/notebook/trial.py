@@ -283,8 +283,8 @@ class Trial:
         """The trial as ``xarray.Dataset.from_dict`` takes it: every stream but the video's frames.
 
         Each stream has a dimension of its name, with its times in ``NAME_t_ns``; units are in the
-        names. Attributes are the trial's condition, its onsets where it is labelled, and whether
-        it is simulated.
+        names. Attributes are the trial's condition and context, its onsets where it is labelled,
+        and whether it is simulated.
 
         Raises:
             StoreError: the trial is damaged.
@@ -318,7 +318,7 @@ class Trial:
         if counts.pulses:
             add("pulses", self.pulses())
         attrs: Json = {"campaign": self.campaign, "trial": self.id, "simulated": self.simulated}
-        attrs |= self.recording.record.condition
+        attrs |= self.recording.described
         if self._labelled:
             times, displacement_px = self._displacements() or (None, None)
             if times is not None:
@@ -369,7 +369,7 @@ class Trial:
         record = self.recording.record
         labelled = vars(self.onsets()) if self._labelled else {"label": "none yet"}
         counts = {name: count for name, count in vars(record.counts).items() if count}
-        return pairs_html(repr(self), {**record.condition, **counts, **labelled})
+        return pairs_html(repr(self), {**self.recording.described, **counts, **labelled})
 
     @property
     def _labelled(self) -> bool:

@@ -7,7 +7,7 @@ what only they have (`flows.server.schedules`).
 from __future__ import annotations
 
 import re
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
@@ -15,6 +15,8 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import faults_of
 from sliplab.protocols.yaml_file import StrictModel
 
+Period = Literal["week", "month"]
+"""Of a report: the last 7 days, or the last month."""
 _UNIT = re.compile("_(c|percent)$")
 OptionsT = TypeVar("OptionsT", bound=StrictModel)
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypedDict
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, check_disk, make_request, missing_bytes
 from sliplab.flows.running.console import size
+from sliplab.flows.skin_change import to_repeat
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Move
 from sliplab.protocols.shown import plural
@@ -22,6 +23,7 @@ from sliplab.rigs.core.calibration import COMMANDS, find_faults, measured_on
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.twin import warnings
+from sliplab.storage.trials.context import SKIN, LoggedContext
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
 
@@ -85,6 +87,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
     except InputError as error:
         found.append(PreflightCheck("space", False, error.expected))
     found += _check_calibration(run_request, rig)
+    found += _check_skin(run_request)
     found += check_devices(run_request)
     return found
 
@@ -124,6 +127,21 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[PreflightChec
         age = " (simulated: any age)" if run_request.rig.simulated else ""
         found.append(PreflightCheck("calibration", True, f"{days}{age}"))
     return found
+
+
+def _check_skin(run_request: RunRequest) -> list[PreflightCheck]:
+    """Name what belongs to another skin than the one that was logged for the campaign."""
+    if not Store.exists(run_request.store):
+        return []
+    store = Store.open(run_request.store)
+    campaign = store.campaign(run_request.campaign)
+    logged = LoggedContext(store, campaign.name)
+    if SKIN not in logged.read() or (change := logged.last()) is None:
+        return []
+    skins = {item.trial_id: item.context.get(SKIN) for item in campaign.recordings()}
+    items = to_repeat(store, campaign, run_request.plan, change, skins, run_request.rig)
+    done = [PreflightCheck("skin", True, f"{change.context[SKIN]}, logged by {change.who}")]
+    return [PreflightCheck("skin", True, str(item), True) for item in items] or done
 
 
 def _outside_camera(run_request: RunRequest) -> str:

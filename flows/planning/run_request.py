@@ -34,6 +34,7 @@ from sliplab.protocols.yaml_file import (
 from sliplab.rigs.mock.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
+from sliplab.storage.trials.context import SKIN, LoggedContext
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
 
 Claims = Literal["use", "overrule", "ignore"]
@@ -197,6 +198,8 @@ def make_request(
     )
     if begun:
         _check_same(run_request, begun)
+    elif not rig_file.simulated and Store.exists(store):
+        _check_skin(run_request, rig)
     return run_request
 
 
@@ -226,9 +229,17 @@ def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
             "analysis, levels or repetitions is fine, anything else would mix two experiments. "
             f"Give the new one its own name with --campaign.{_changed(run_request, campaign)}"
         )
+    logged = LoggedContext(Store(run_request.store), campaign.name).read().get(SKIN)
+    begun_on = read_text(campaign.folder / "rig.yaml", "rig file")
     if info["rig_hash"] != rig_hash(run_request.rig_text) and not same_rig(
-        read_text(campaign.folder / "rig.yaml", "rig file"), run_request.rig_text
+        begun_on, run_request.rig_text, skin=logged
     ):
+        serial = run_request.rig.skin.serial
+        if same_rig(begun_on, run_request.rig_text, skin=serial):
+            raise StoreError(
+                f"{campaign.folder}: the rig file has another skin than the campaign, or what was "
+                f"measured on it: log it with `sliplab log {run_request.store} --skin {serial}`"
+            )
         raise StoreError(
             f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
             f"give the new one its own name with --campaign.{_rig_changed(run_request, campaign)}"
@@ -239,6 +250,24 @@ def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
             f"{min(missing)}; a protocol may only add trials to a campaign."
             f"{_changed(run_request, campaign)}"
         )
+
+
+def _check_skin(run_request: RunRequest, file: Path) -> None:
+    """Check that a new campaign's rig file does not name a skin that was replaced.
+
+    Raises:
+        InputError: the log of the store says so.
+    """
+    store, serial = Store.open(run_request.store), run_request.rig.skin.serial
+    for campaign in store.campaigns():
+        if campaign.info.get("rig") != run_request.rig.name:
+            continue
+        logged = LoggedContext(store, campaign.name)
+        now = logged.read().get(SKIN, serial)
+        before = load_rig_file(campaign.folder / "rig.yaml", stored=True)[0].skin.serial
+        if now != serial == before:
+            text = f"was replaced by {now} (log of {store.folder}): write the skin that is mounted"
+            raise InputError(file, "skin.serial", serial, text)
 
 
 def _changed(run_request: RunRequest, campaign: Campaign) -> str:

@@ -126,6 +126,12 @@ def was_stopped(ended: Json) -> bool:
     return str(ended.get("message", "")).startswith("KeyboardInterrupt")
 
 
+def was_killed(run: Json) -> bool:
+    """Return whether the process of a run without an end is gone, as far as this machine knows."""
+    process = run.get("process", {})
+    return process.get("host") == this_process()["host"] and not is_here(process)
+
+
 def open_runs(store: Path) -> list[Json]:
     """Return the runs that began and did not end, as far as the store knows."""
     return [run for run, ended in runs(store) if ended is None]
@@ -142,14 +148,7 @@ def close_killed_runs(store: Path, server: str, client: Any = None) -> list[Json
     Returns:
         The runs that were closed because their process was killed.
     """
-    here = this_process()["host"]
-    dead = [
-        item
-        for item in open_runs(store)
-        if item.get("server") == server
-        and item.get("process", {}).get("host") == here
-        and not is_here(item["process"])
-    ]
+    dead = [item for item in open_runs(store) if item.get("server") == server and was_killed(item)]
     owed = _owed(store, server)
     if not dead and not owed:
         return []

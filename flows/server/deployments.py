@@ -27,6 +27,8 @@ from sliplab.flows.server.schedules import (
     Evaluate,
     OnRig,
     ScheduledChain,
+    ScheduledPush,
+    ScheduledReport,
     ScheduledStep,
     ScheduledStudy,
     window_end,
@@ -153,6 +155,7 @@ def _words(error: Exception) -> str:
 
 
 STEP, EVALUATE, STUDY, ASK = ScheduledStep(), Evaluate(), ScheduledStudy(), Ask()
+REPORT, PUSH = ScheduledReport(), ScheduledPush()
 served: Callable[..., Any] = partial(
     flow, persist_result=False, result_storage=orchestration.NO_RESULTS
 )
@@ -184,9 +187,9 @@ def evaluate(wanted: Evaluate = EVALUATE) -> Any:
 
 
 @served(name="report")
-def report(wanted: ScheduledStep = STEP) -> Any:
-    """Write report/index.html and report/summary.json."""
-    return run_of(lambda here, run: _steps(here, wanted.campaigns, "report"))
+def report(wanted: ScheduledReport = REPORT) -> Any:
+    """Write report/index.html and report/summary.json, or the page of a period."""
+    return run_of(partial(_report, wanted))
 
 
 @served(name="study")
@@ -199,6 +202,12 @@ def study(wanted: ScheduledStudy = STUDY) -> Any:
 def chain(wanted: ScheduledChain) -> Any:
     """Collect, then label, train and evaluate the trials in the store."""
     return run_of(partial(_chain, wanted))
+
+
+@served(name="push")
+def push(wanted: ScheduledPush = PUSH) -> Any:
+    """Send committed trials to a remote store; it may run while trials are taken."""
+    return run_of(partial(_push, wanted))
 
 
 @served(name="pause")
@@ -221,6 +230,8 @@ def stop(wanted: Ask = ASK) -> Any:
 
 ON_RIG = (collect, label, train, evaluate, report, study, chain)
 """One at a time: what moves the arm, and what needs both cores."""
+BESIDE = (push,)
+"""One at a time, beside those on the rig: a network that does not answer delays no trial."""
 CONTROL = (pause, resume, stop)
 """At any time."""
 
@@ -287,6 +298,33 @@ def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> st
     step = getattr(import_module(STEPS[name]), name)
     result = step(store, collected(store, campaigns or None), **options)
     return f"{name}: {result['done']} done, {result['fresh']} were fresh"
+
+
+def _report(wanted: ScheduledReport, here: Service, run: Any) -> str:
+    from sliplab.flows.period import period_before, write_period_report
+
+    if wanted.period is None:
+        return _steps(here, wanted.campaigns, "report")
+    now = datetime.now().astimezone()
+    page = write_period_report(open_store(here.folder), *period_before(now, wanted.period), now)
+    return f"report of the last {wanted.period}: {page}"
+
+
+def _push(wanted: ScheduledPush, here: Service, run: Any) -> str:
+    from sliplab.storage.remote.objects import Remote
+    from sliplab.storage.remote.push import PushOptions, push
+
+    store, url = open_store(here.folder), here.url(wanted.url)
+    there = {campaign.name: campaign for campaign in store.campaigns()}
+    for name in wanted.campaigns:
+        if name not in there:
+            raise InputError("campaigns", "", name, f"must be one of {', '.join(there)}")
+    chosen = [there[name] for name in wanted.campaigns or there]
+    options = PushOptions(quarantine=wanted.quarantine)
+    done = push(store, Remote(url), chosen, options, on_bytes=lambda _: stopping.check())
+    if done.problems:
+        raise StoreError(f"{url}: {len(done.problems)} not sent; first: {done.problems[0]}")
+    return f"push: {plural(done.pushed, 'trial')} sent, {done.there} were there"
 
 
 def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:

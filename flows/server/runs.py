@@ -168,10 +168,10 @@ def _carry_out(run_id: str, flow_name: str) -> None:
     from prefect.flow_engine import run_flow
     from prefect.settings import temporary_settings
 
-    from sliplab.flows.server.deployments import ON_RIG
+    from sliplab.flows.server.deployments import BESIDE, ON_RIG
     from sliplab.flows.server.service import service
 
-    (flow,) = (flow for flow in ON_RIG if flow.name == flow_name)
+    (flow,) = (flow for flow in (*ON_RIG, *BESIDE) if flow.name == flow_name)
     here = service()
     link = orchestration.ServerLink(here.server)
     with temporary_settings(updates=orchestration.limited_settings()), link.client() as client:

@@ -5,11 +5,13 @@ schedules:
   - {name: nights, flow: collect, protocol: kinematic.yaml,
      days: [mon, tue, wed, thu], from: "22:00", until: "06:00"}
   - {name: morning report, flow: report, cron: "30 7 * * mon-fri"}
+  - {name: weekly report, flow: report, period: week, cron: "0 8 * * mon"}
+  - {name: copy, flow: push, url: "s3://lab/kinematic", cron: "5 6 * * tue-fri"}
 
 Store and rig are no parameters: they are those that `sliplab serve` was started with, so that an
-arm's data cannot be sent elsewhere from a page. A window is computed from when its run was due and
-not from when it began: a run that starts late, because the computer was off, must not take the rest
-of its night out of the next day.
+arm's data cannot be sent elsewhere from a page; `url` is one of those in the file. A window is
+computed from when its run was due and not from when it began: a run that starts late, because the
+computer was off, must not take the rest of its night out of the next day.
 """
 
 from __future__ import annotations
@@ -25,7 +27,12 @@ from zoneinfo import ZoneInfo, available_timezones
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from sliplab.flows.planning import parameters
-from sliplab.flows.planning.parameters import CollectOptions, RuleOptions, SessionMetadata
+from sliplab.flows.planning.parameters import (
+    CollectOptions,
+    Period,
+    RuleOptions,
+    SessionMetadata,
+)
 from sliplab.protocols import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.shown import did_you_mean, one_of
@@ -165,6 +172,33 @@ class ScheduledStep(StrictModel):
     campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
+class ScheduledReport(ScheduledStep):
+    """Parameters of the report."""
+
+    period: Period | None = Field(
+        default=None,
+        description="Report the last week or month instead: trials, failures, drift, disk, log.",
+    )
+
+
+def _url(text: str) -> str:
+    from sliplab.storage.remote.objects import check_url
+
+    try:
+        return check_url(text) if text else text
+    except InputError as error:
+        raise ValueError(error.expected) from None
+
+
+class ScheduledPush(ScheduledStep):
+    """Parameters of sending committed trials to a remote store."""
+
+    url: Annotated[str, AfterValidator(_url)] = Field(
+        default="", description="One that the schedules name; by default the first of these."
+    )
+    quarantine: bool = Field(default=False, description="Quarantined trials, too.")
+
+
 class Evaluate(RuleOptions, ScheduledStep):
     """Parameters of evaluating the network on the test trials."""
 
@@ -175,15 +209,16 @@ class Ask(parameters.ControlOptions):
     who: str = Field(default="", description="Your name; default: Prefect's page.")
 
 
-FlowName = Literal["collect", "label", "train", "evaluate", "report", "study", "chain"]
+FlowName = Literal["collect", "label", "train", "evaluate", "report", "study", "chain", "push"]
 SCHEDULED: dict[FlowName, type[StrictModel]] = {
     "collect": Collect,
     "label": ScheduledStep,
     "train": ScheduledStep,
     "evaluate": Evaluate,
-    "report": ScheduledStep,
+    "report": ScheduledReport,
     "study": ScheduledStudy,
     "chain": ScheduledChain,
+    "push": ScheduledPush,
 }
 """Flows that a schedule may start; `pause`, `resume` and `stop` are for people."""
 
@@ -280,12 +315,12 @@ def load_schedules(path: Path) -> list[Scheduled]:
 
 
 def has_alerts(path: Path) -> bool:
-    """Return whether a file of schedules has the section ``alerts:``.
+    """Return whether a file of schedules, or a rig file, has the section ``alerts:``.
 
     Raises:
         InputError: it is not YAML.
     """
-    return parse_yaml(read_text(path, "schedule file"), path).get("alerts") is not None
+    return parse_yaml(read_text(path, "file"), path).get("alerts") is not None
 
 
 def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
@@ -300,6 +335,8 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     parameters = model.model_dump(mode="json", exclude=_TIMING, exclude_unset=True)
     if issubclass(SCHEDULED[flow], OnRig):
         parameters["timezone"] = timezone
+    if flow == "push" and not model.url:
+        raise InputError(path, "url", model.url, "is missing; give one like s3://bucket/folder")
     if "protocol" in parameters:
         parameters["protocol"] = _protocol(path, model.protocol, model.enable)
         _check_campaign(path, model.campaign)

@@ -64,7 +64,9 @@ def serve(
         url, page = stack.enter_context(page_server(port))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
-        here = Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols)
+        urls = tuple(item.parameters["url"] for item in schedules if "url" in item.parameters)
+        folder = str(store.folder.resolve())
+        here = Service(folder, rig, name, server, os.getpid(), protocols, urls)
         here.export_environment()
         for item in run_records.close_killed_runs(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
@@ -85,12 +87,12 @@ async def _serve(
         temporary_settings,
     )
 
-    from sliplab.flows.server.deployments import CONTROL, ON_RIG
+    from sliplab.flows.server.deployments import BESIDE, CONTROL, ON_RIG
 
     stopped = asyncio.Event()
-    on_rig: dict[UUID, Any] = {}
-    control: dict[UUID, Any] = {}
-    for flow in (*ON_RIG, *CONTROL):
+    registered: dict[UUID, Any] = {}
+    flows = (*ON_RIG, *BESIDE, *CONTROL)
+    for flow in flows:
         await _refuse_another(flow.name, here.name, here.folder)
         when = _prefects([item for item in schedules if item.flow == flow.name])
         made = await flow.ato_deployment(
@@ -99,29 +101,37 @@ async def _serve(
             tags=_tags(here.folder, here.rig),
             description=flow.description,
         )
-        (on_rig if flow in ON_RIG else control)[await made.aapply()] = flow
-    names = [flow.name for flow in (*ON_RIG, *CONTROL)]
+        registered[await made.aapply()] = flow
+    names = [flow.name for flow in flows]
     await _close_stranded(here.name, names, here.folder)
     await _delete_older(here.name, names, here.folder)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    served = ServedRuns(here.folder, on_rig, control)
+
+    def lane(*of: Sequence[Any]) -> ServedRuns:
+        """Return what executes the runs of some flows, by one process at a time."""
+        runs = [{run: flow for run, flow in registered.items() if flow in some} for some in of]
+        return ServedRuns(here.folder, *runs)
+
+    lanes = [lane(ON_RIG, CONTROL), lane(BESIDE, ())]
     # a server that does not answer is queried again next time
     limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
     with temporary_settings(updates=limits):
-        carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))
+        working = [
+            asyncio.create_task(each.carry_out(min(poll_s, POLL_S), stopped)) for each in lanes
+        ]
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     alerting = asyncio.create_task(keep_alerting(here.folder, alerts, stopped))
     ending = asyncio.create_task(stopped.wait())
     shown = ", ".join(deployment_name(flow.name, here.name) for flow in (ON_RIG[0], *CONTROL))
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments {shown} and others")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
-    await asyncio.wait([ending, carrying_out], return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait([ending, *working], return_when=asyncio.FIRST_COMPLETED)
     console.say("stopping: the arm first, then all runs")
     stopped.set()
     for outcome in await asyncio.gather(
-        carrying_out, watching, alerting, ending, return_exceptions=True
+        *working, watching, alerting, ending, return_exceptions=True
     ):
         if isinstance(outcome, Exception):
             raise outcome

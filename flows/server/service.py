@@ -29,6 +29,7 @@ class Service:
         pid: of the program that serves.
         protocols: folders below which a run may name its protocol, and files that a schedule names;
             a relative name is of the first.
+        urls: of remote stores that schedules name.
     """
 
     store: str
@@ -37,6 +38,7 @@ class Service:
     server: str
     pid: int
     protocols: tuple[str, ...]
+    urls: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -74,6 +76,19 @@ class Service:
             raise InputError(found, "", None, "is not a valid protocol; `sliplab plan` shows why")
         return found
 
+    def url(self, given: str) -> str:
+        """Return the URL that a run's parameter names; data are sent nowhere else.
+
+        Raises:
+            InputError: no schedule names it.
+        """
+        if given in self.urls:
+            return given
+        if not given and self.urls:
+            return self.urls[0]
+        known = ", ".join(self.urls) or "none: give a schedule of the flow push its url"
+        raise InputError("url", "", given, f"must be one that the schedules name ({known})")
+
 
 def service() -> Service:
     """Return the settings of the service that started this process.
@@ -85,4 +100,5 @@ def service() -> Service:
     if text is None:
         raise RuntimeError("this flow runs only under `sliplab serve`")
     given = json.loads(text)
-    return Service(**{**given, "protocols": tuple(given["protocols"])})
+    lists = {name: tuple(given[name]) for name in ("protocols", "urls")}
+    return Service(**{**given, **lists})

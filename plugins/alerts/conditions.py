@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
 
 from sliplab.flows.running import run_records
 from sliplab.flows.status import CampaignStatus, StoreStatus, night_of
@@ -32,6 +35,8 @@ GRADES = (
     "unknown",
 )
 """Grades of a clock, best first."""
+LOOK_BACK = 50
+"""Last committed trials whose clocks are compared: more than are taken between two looks."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ def events(
 def _events(
     store: Store, state: StoreStatus, settings: AlertSettings, now: datetime
 ) -> Iterator[Event]:
-    yield from _failed_runs(store)
+    yield from _failed_runs(store, now)
     yield from _long_pause(store, settings, now)
     yield from _idle(state, settings, now)
     for item in state.campaigns:
@@ -71,15 +76,16 @@ def _events(
         if IMPORTED in campaign.info:
             continue
         yield from _set_aside(campaign.name, campaign.quarantined(), settings, now)
-        yield from _grades(store, campaign.name, now)
+        yield from _grades(store, campaign.name)
 
 
-def _failed_runs(store: Store) -> Iterator[Event]:
+def _failed_runs(store: Store, now: datetime) -> Iterator[Event]:
     for run, ended in run_records.runs(store.folder):
-        if ended is None or run_records.was_stopped(ended):
-            continue
-        if ended.get("state") in FAILED:
-            name = run.get("deployment") or run["flow"]
+        name = run.get("deployment") or run["flow"]
+        if ended is None:
+            if run_records.was_killed(run):  # the next program that opens the store writes its end
+                yield Event(f"run {run['run']}", "run failed", f"{name}: its process is gone", now)
+        elif ended.get("state") in FAILED and not run_records.was_stopped(ended):
             text = f"{name} {str(ended['state']).lower()}: {ended.get('message') or 'no message'}"
             since = datetime.fromisoformat(ended["when"])
             yield Event(f"run {run['run']}", "run failed", text, since)
@@ -146,31 +152,33 @@ def _set_aside(
             yield Event(f"aside {campaign} {trial} {len(causes)}", "trial set aside", text, now)
 
 
-def _grades(store: Store, campaign: str, now: datetime) -> Iterator[Event]:
-    """Compare the clocks of the last two committed trials."""
-    folders = list(store.campaign(campaign).folders("trials"))
-    known = sorted(folders, key=lambda folder: (folder.stat().st_mtime_ns, folder.name))[-2:]
-    records = []
-    for folder in known:
-        try:
-            records.append(TrialRecord.load(folder / RECORD))
-        except (OSError, ValueError):
-            return
-    if len(records) < 2:
-        return
-    before, last = (_grades_of(record) for record in records)
-    for device, grade in last.items():
-        if device in before and _rank(grade) > _rank(before[device]):
-            trial = records[1].trial
-            text = (
-                f"{campaign}: the clock of {device} fell from {before[device]} to {grade} "
-                f"with trial {trial}"
-            )
-            yield Event(f"grade {campaign} {trial} {device}", "clock grade", text, now)
+def _grades(store: Store, campaign: str) -> Iterator[Event]:
+    """Compare the clocks of each of the last committed trials with those of the one before."""
+    folders = {path: path.stat().st_mtime_ns for path in store.campaign(campaign).folders("trials")}
+    known = sorted(folders, key=lambda path: (folders[path], path.name))[-LOOK_BACK:]
+    for earlier, path in pairwise(known):
+        before, last = (_grades_of(each, folders[each]) for each in (earlier, path))
+        for device, grade in last.items():
+            if device in before and _rank(grade) > _rank(before[device]):
+                text = (
+                    f"{campaign}: the clock of {device} fell from {before[device]} to {grade} "
+                    f"with trial {path.name}"
+                )
+                since = datetime.fromtimestamp(folders[path] / 1e9).astimezone()
+                yield Event(f"grade {campaign} {path.name} {device}", "clock grade", text, since)
 
 
-def _grades_of(record: TrialRecord) -> dict[str, str]:
-    clocks = record.to_json().get("clocks", {})
+@lru_cache(4 * LOOK_BACK)
+def _grades_of(folder: Path, changed_ns: int) -> dict[str, str]:
+    """Return the grade of each device; nothing of a trial that cannot be read.
+
+    Args:
+        changed_ns: when the folder was last changed: another trial has another time.
+    """
+    try:
+        clocks = TrialRecord.load(folder / RECORD).to_json().get("clocks", {})
+    except (OSError, ValueError):
+        return {}
     return {
         name: str(clock["grade"])
         for name, clock in clocks.items()

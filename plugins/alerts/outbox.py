@@ -5,16 +5,18 @@
 
 An event is written before it is sent, under a name made of its key: it is sent once, however often
 it is found. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
-the others are not affected.
+the others do not wait for it: each message is sent in a thread.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -26,6 +28,8 @@ from sliplab.storage.trials.store import Store
 FOLDER, BEGAN = "alerts", "began.json"
 EVER = datetime.min.replace(tzinfo=UTC)
 FIRST_RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
+WAIT_S = 1.0
+"""Longest wait for the targets' answers, s; later ones are found at the next look."""
 
 
 class Target(Protocol):
@@ -38,6 +42,23 @@ class Target(Protocol):
         """Return whether the message was taken."""
 
 
+class _Message(threading.Thread):
+    """A message on its way to one target; a network that never answers does not delay the end.
+
+    Attributes:
+        paths: files of its events. taken: whether the target took it, once the thread has ended.
+    """
+
+    def __init__(self, target: Target, title: str, events: Mapping[Path, Json]) -> None:
+        super().__init__(name="message", daemon=True)
+        self._send = partial(target.send, title, _text(events.values()))
+        self.paths, self.taken = list(events), False
+
+    def run(self) -> None:
+        """Send it."""
+        self.taken = self._send()
+
+
 @dataclass
 class _Line:
     """A target, and when it is tried next."""
@@ -48,6 +69,8 @@ class _Line:
     next_try: datetime = EVER
     sent: list[datetime] = field(default_factory=list)
     """Of the last hour."""
+    message: _Message | None = None
+    """The one on its way."""
 
 
 class Outbox:
@@ -70,7 +93,13 @@ class Outbox:
         make_folder(self._folder)
         write_new_json(self._folder / BEGAN, {"began": _utc(now)})
         self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
-        self._lines = [_Line(target, _digest(target.name)) for target in targets]
+        # addresses that differ in their secrets alone have one name
+        names = [target.name for target in targets]
+        same = [names[:k].count(name) for k, name in enumerate(names)]
+        self._lines = [
+            _Line(target, _digest(f"{target.name}#{k}" if k else target.name))
+            for target, k in zip(targets, same, strict=True)
+        ]
         self._most, self._say = most_per_hour, say
         files = {path: read_json(path) for path in self._files()}
         self._known = set(files)
@@ -101,11 +130,10 @@ class Outbox:
         Args:
             quiet: only urgent ones.
         """
-        due = [line for line in self._lines if line.next_try <= now]
-        work = []
-        for line in due:
+        taken = self._collect(now)
+        for line in self._lines:
             line.sent = [moment for moment in line.sent if now - moment < timedelta(hours=1)]
-            if len(line.sent) >= self._most:
+            if line.message is not None or line.next_try > now or len(line.sent) >= self._most:
                 continue
             events = {
                 path: data
@@ -113,16 +141,24 @@ class Outbox:
                 if _unsent(data, line) and (data["urgent"] or not quiet)
             }
             if events:
-                work.append((line, events))
-        if not work:
-            return 0
-        with ThreadPoolExecutor(len(work)) as pool:  # a slow target delays no other
-            taken = list(
-                pool.map(lambda each: each[0].target.send(title, _text(each[1].values())), work)
-            )
-        for (line, events), well in zip(work, taken, strict=True):
-            self._note(line, list(events), well, now)
-        return sum(taken)
+                line.message = _Message(line.target, title, events)
+                line.message.start()
+        end = time.monotonic() + WAIT_S
+        for line in self._lines:
+            if line.message is not None:
+                line.message.join(max(end - time.monotonic(), 0.0))
+        return taken + self._collect(now)
+
+    def _collect(self, now: datetime) -> int:
+        """Note the messages whose targets have answered; return the number of those taken."""
+        done = 0
+        for line in self._lines:
+            message = line.message
+            if message is not None and not message.is_alive():
+                line.message = None
+                self._note(line, message.paths, message.taken, now)
+                done += message.taken
+        return done
 
     def _note(self, line: _Line, events: list[Path], well: bool, now: datetime) -> None:
         if not well:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
@@ -101,7 +101,7 @@ class AlertWatcher:
         wall = now.astimezone(ZoneInfo(self._settings.timezone))
         hour, minute = map(int, self._settings.summary.split(":"))
         due = wall.replace(hour=hour, minute=minute, second=0, microsecond=0)
-        if due <= wall < due + timedelta(hours=1):
+        if due <= wall:
             text = "\n".join(state_lines(state))
             self._outbox.add(Event(f"summary {due:%Y-%m-%d}", "summary", text, due), True)
 

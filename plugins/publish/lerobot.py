@@ -282,7 +282,10 @@ def _grid(recording: Recording) -> tuple[int, int]:
 def _task(recording: Recording) -> str:
     record = recording.record
     return ", ".join(
-        [record.experiment, *(f"{k} {v}" for k, v in sorted(record.condition.items()))]
+        [
+            record.experiment,
+            *(f"{k} {v}" for k, v in sorted({**record.condition, **record.context}.items())),
+        ]
     )
 
 

@@ -96,10 +96,11 @@ def _trials(publication: Publication, path: TrialPath) -> pa.Table:
     units: dict[str, str] = {}
     for _, recording in publication.recordings:
         units |= {name: about.unit or "" for name, about in recording.record.streams.items()}
-        for factor, level in recording.record.condition.items():
+        for factor, level in recording.described.items():
             (column,) = condition_columns({factor: level})
             unit = level.partition(" ")[2]
-            factors[column] = f"level of the factor {factor}{f', {unit}' if unit else ''}"
+            what = "level of the factor" if factor in recording.record.condition else "context:"
+            factors[column] = f"{what} {factor}{f', {unit}' if unit else ''}"
     meanings = {name: _TRIAL_COLUMNS.get(name) or factors.get(name) for name in rows.columns}
     return _table(rows, {name: text or _figure(name, units) for name, text in meanings.items()})
 

@@ -270,6 +270,18 @@ def _fault(name: str, key: str, value: str, text: str) -> CalibrationFault:
     return CalibrationFault(f"calibration.{name}.{key}", value, text, COMMANDS[name])
 
 
+ON_THE_SKIN = ("tool_centre_point", "depth_zero", "event_crop")
+"""Entries that depend on the skin, as `touch_depth` does."""
+
+
+def without_skin(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a rig file's data without the skin's own number and what was measured on it."""
+    skin = {key: value for key, value in data["skin"].items() if key not in {"serial", "made"}}
+    of_skin = {*ON_THE_SKIN, "touch_depth"}
+    retained = {k: v for k, v in data["calibration"].items() if k not in of_skin}
+    return {**data, "skin": {"serial": "-", **skin}, "calibration": retained}
+
+
 def without_taught(data: dict[str, Any]) -> dict[str, Any]:
     """Return a rig file's data without the plate's taught position and without ages.
 

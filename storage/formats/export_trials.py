@@ -70,6 +70,8 @@ def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
     stored = record.model_dump(
         mode="json", include={"experiment", "role", "clocks", "steps"}, exclude_unset=True
     )
+    if record.context:
+        stored["context"] = recording.context
     return {
         "trial": recording.trial_id,
         "file": name,

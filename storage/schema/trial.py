@@ -317,6 +317,9 @@ class TrialRecord(Document):
     attempt: Int
     condition: dict[str, Level]
     """Levels by factor, with their units."""
+    context: dict[str, Level] = Field(default_factory=dict)
+    """What people had logged by then of skin, temperature and so on, by name; it comes before what
+    the condition says of it. Written only where there is any."""
     seed: Annotated[int, Field(strict=True)] | None = None
     rig: str | None = None
     simulated: Bool

@@ -43,7 +43,7 @@ else:
     pa = Later("pyarrow")
     pq = Later("pyarrow.parquet")
 
-VERSION = 1
+VERSION = 2
 """Of the index and of the catalogue's rows: a change of either counts on."""
 FRESH_NS = 2_000_000_000
 """Age below which a change may not show in a time stamp: some disks count in seconds."""
@@ -56,11 +56,11 @@ UNREAD = "unread_bytes"
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
-    """One row a committed trial: campaign, id, condition, counts, quality.
+    """One row a committed trial: campaign, id, condition and context, counts, quality.
 
-    Conditions become columns by factor; levels with a unit are numbers, the unit is in the
-    column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since the
-    catalogue was last read are not read again.
+    Conditions and context become columns by name; levels with a unit are numbers, the unit is in
+    the column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since
+    the catalogue was last read are not read again.
 
     Args:
         unreadable: gets a line for every trial that is damaged; without it, one is an error.
@@ -337,7 +337,7 @@ def _row(campaign: str, recording: Recording) -> Row:
         "sync_uncertainty_us": None if uncertainty_ns is None else uncertainty_ns / 1000,
         "passed": record.quality.passed,
         **_missing(recording),
-        **condition_columns(record.condition),
+        **condition_columns(recording.described),
         **{
             f"{name}_{figure}": value
             for name, stream in record.streams.items()

@@ -15,7 +15,7 @@ from sliplab.protocols.program import ACTING
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
-from sliplab.storage.schema.trial import SyncResult, TrialClockMaps, TrialRecord
+from sliplab.storage.schema.trial import Provenance, SyncResult, TrialClockMaps, TrialRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
     F64,
@@ -31,6 +31,7 @@ from sliplab.storage.streams import (
 from sliplab.storage.trials.checksums import (
     DATA,
     FRAMES,
+    PROVENANCE,
     RECORD,
     Checksums,
     Fetch,
@@ -92,6 +93,28 @@ class Recording:
             raise StoreError(str(error)) from None
         except DocumentError as error:
             raise self._damaged(str(error)) from None
+
+    @cached_property
+    def context(self) -> dict[str, str]:
+        """The skin, and what people had logged by then of temperature and so on, by name.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        try:
+            skin = Provenance.load(self.folder / PROVENANCE).skin
+        except FileNotFoundError:
+            skin = None
+        except (OSError, DocumentError, NewerFormat) as error:
+            raise StoreError(str(error)) from None
+        return {**({"skin": skin} if skin else {}), **self.record.context}
+
+    @property
+    def described(self) -> dict[str, str]:
+        """The condition and the context, by name; logged context comes before what was planned."""
+        planned = self.record.condition
+        known = {name: value for name, value in self.context.items() if name not in planned}
+        return {**planned, **known, **self.record.context}
 
     @property
     def trial_id(self) -> str:

@@ -70,15 +70,17 @@ AGAIN, FORGIVEN = "again", "forgiven"
 """Cause of a committed trial that is to be retaken; mark of a failed attempt that is no longer
 counted."""
 _FOLDERS = ("campaigns", "control", "log", "derived", "models", "report", "before")
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+")
 """Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
 
 def refuse_url(path: Path) -> None:
     """Check that a path was not given as a URL. Raises NoStore."""
-    if _URL.match(str(path)):
+    if found := _URL.match(str(path)):
+        slashes = "///" if found[1] == "file" else "//"  # a path has lost all but one
+        url = f"{found[1]}:{slashes}{str(path)[found.end() :]}"
         text = "give a folder, then `sliplab push FOLDER URL`, or first `sliplab pull URL FOLDER`"
-        raise NoStore(path, f"is a URL, not a folder; {text}")
+        raise NoStore(url, f"is a URL, not a folder; {text}")
 
 
 def known_cause(folder: Path) -> Json | None:

@@ -146,8 +146,8 @@ def test_levels_to_be_enabled(given: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("holdout", "s3://bucket/x"), "s3:/bucket/x: is a URL, not a folder"),
-        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "s3:/b/x: is a URL"),
+        (("holdout", "s3://bucket/x"), "s3://bucket/x: is a URL, not a folder"),
+        (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "s3://b/x: is a URL"),
         (
             ("import", "file:///x", "--store", "x", "--name", "x"),
             "file:/x: is a URL",

@@ -31,6 +31,7 @@ NIGHT: dict[str, Any] = {
 }
 
 
+PUSH: dict[str, Any] = {"flow": "push", "protocol": None, "until": None}
 ODD_CRONS = ("RRULE:FREQ=DAILY", "\u0663 22 * * *")
 
 
@@ -66,6 +67,14 @@ def test_the_shipped_example_is_right() -> None:
             ({"cron": cron, "days": None, "from": None}, f".cron = {cron}: must have five fields")
             for cron in ("0 0 22 * * *", "*/10 * * * * *", "0 22 * *", "@daily", *ODD_CRONS)
         ),
+        *(
+            ({**PUSH, "url": url}, f"schedules[0].url{says}")
+            for url, says in (
+                (None, ": is missing; give one like s3"),
+                ("http://lab/x", " = http://lab/x: is a web page's address"),
+                ("s3://key:hunter2@lab/x", " = "),
+            )
+        ),
         ({"timezone": "UTC"}, "schedules[0].timezone = UTC: applies to the whole file"),
         ({"trials": 0}, "schedules[0].trials = 0"),
         ({"name": "Nights!"}, "schedules[0].name = Nights!"),
@@ -90,6 +99,15 @@ def test_what_is_wrong_is_named(tmp_path: Path, change: dict[str, Any], said: st
     with pytest.raises(InputError) as error:
         load_schedules(write(tmp_path, wrong))
     assert said in error.value.message
+    assert "hunter2" not in error.value.message
+
+
+def test_a_push_and_a_report_of_a_period_are_scheduled(tmp_path: Path) -> None:
+    push = {"name": "copy", "flow": "push", "url": "s3://lab/one", "cron": "5 6 * * *"}
+    week = {"name": "weekly", "flow": "report", "period": "week", "cron": "0 8 * * mon"}
+    copy, weekly = load_schedules(write(tmp_path, push, week))
+    assert (copy.flow, copy.parameters) == ("push", {"url": "s3://lab/one"})
+    assert (weekly.flow, weekly.parameters) == ("report", {"period": "week"})
 
 
 def test_a_value_is_shown_as_it_was_written(tmp_path: Path) -> None:

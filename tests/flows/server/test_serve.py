@@ -22,7 +22,15 @@ from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.flows.server import deployments, serve
 from sliplab.flows.server.deployments import until_of
-from sliplab.flows.server.schedules import Ask, Collect, OnRig, Scheduled, ScheduledChain
+from sliplab.flows.server.schedules import (
+    Ask,
+    Collect,
+    OnRig,
+    Scheduled,
+    ScheduledChain,
+    ScheduledPush,
+    ScheduledReport,
+)
 from sliplab.flows.server.service import Service
 from sliplab.plugins.claims.document import StoppingRecord
 from sliplab.protocols import InputError
@@ -34,6 +42,8 @@ from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.server.serving import Page, until
+from tests.storage.trial_files import campaign as plain_campaign
+from tests.storage.trial_files import commit
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
@@ -102,6 +112,33 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     assert made["image"]["data"].startswith("data:image/svg+xml;base64,")
     assert "(simulated)" in made["image"]["description"]
     assert (limit.limit, limit.active_slots) == (1, 0)
+
+
+def test_a_push_goes_only_where_a_schedule_says(
+    service: Service, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.flows.server.deployments import push
+
+    url = f"file://{tmp_path}/remote"
+    stored = plain_campaign(service.folder, "c")
+    commit(stored, "a")
+    state = push(ScheduledPush(url=url), return_state=True)
+    assert (state.type.value, "none: give a schedule" in state.message) == ("FAILED", True)
+    replace(service, urls=(url,)).export_environment()
+    state = push(ScheduledPush(), return_state=True)
+    assert (state.type.value, state.message) == ("COMPLETED", "push: 1 trial sent, 0 were there")
+    state = push(ScheduledPush(url=f"file://{tmp_path}/elsewhere"), return_state=True)
+    assert "must be one that the schedules name" in state.message
+    assert not (tmp_path / "elsewhere").exists()
+    assert [end["state"] for end in ends(service)].count("COMPLETED") == 1
+
+
+def test_a_week_is_reported_without_an_analysis(service: Service) -> None:
+    from sliplab.flows.server.deployments import report
+
+    state = report(ScheduledReport(period="week"), return_state=True)
+    assert state.type.value == "COMPLETED", state.message
+    assert len(list((service.folder / "report" / "periods").glob("*.html"))) == 1
 
 
 @pytest.mark.long

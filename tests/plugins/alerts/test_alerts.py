@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import socketserver
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,17 +20,21 @@ import pytest
 import yaml
 
 from sliplab.flows.running import run_records
+from sliplab.flows.server.schedules import has_alerts
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
 from sliplab.plugins.alerts.conditions import Event, events
-from sliplab.plugins.alerts.outbox import Outbox
+from sliplab.plugins.alerts.outbox import Outbox, Target
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
 from sliplab.plugins.alerts.watcher import AlertWatcher, AppriseTarget
 from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import mask_secrets
+from sliplab.rigs.rig_file import load_rig_file, same_rig
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
+from tests.conftest import ROOT
 from tests.storage.trial_files import campaign, commit, fail
 
 NOW = datetime(2030, 3, 2, 22, 0, tzinfo=UTC)
@@ -176,6 +182,108 @@ def test_nothing_is_lost_while_a_receiver_is_down_and_nothing_is_told_twice(
     assert up.taken == down.taken == ["collect crashed: killed"]
 
 
+def test_a_target_that_never_answers_delays_no_other(tmp_path: Path) -> None:
+    """It gets its message when it comes back, once."""
+    released = threading.Event()
+
+    class Hanging(Receiver):
+        def send(self, title: str, text: str) -> bool:
+            released.wait(60)
+            return super().send(title, text)
+
+    hanging, other = Hanging("json://a"), Receiver("json://b")
+    box = Outbox(Store.create(tmp_path / "s"), [hanging, other], 30, NOW, lambda text: None)
+    for number in range(3):
+        now = NOW + timedelta(seconds=number)
+        box.add(Event(str(number), "paused", f"event {number}", now), urgent=True)
+        began = time.monotonic()
+        box.send("t", now)
+        assert time.monotonic() - began < 5
+    assert other.taken == ["event 0", "event 1", "event 2"]
+    assert hanging.taken == []
+    released.set()
+    for second in range(3, 60):
+        box.send("t", NOW + timedelta(seconds=second))
+    assert hanging.taken == ["event 0", "event 1\nevent 2"]
+
+
+def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Path) -> None:
+    one, other = Receiver("tgram://****"), Receiver("tgram://****", up=False)
+    box = Outbox(Store.create(tmp_path / "s"), [one, other], 30, NOW, lambda text: None)
+    box.add(Event("a", "paused", "text", NOW), urgent=True)
+    box.send("t", NOW)
+    other.up = True
+    box.send("t", NOW + timedelta(seconds=20))
+    assert one.taken == other.taken == ["text"]
+
+
+def test_a_run_that_was_killed_is_told_once(tmp_path: Path) -> None:
+    store, receiver = Store.create(tmp_path / "s"), Receiver()
+    watching, _ = watcher(store, [receiver])
+    run = str(uuid4())
+    run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
+    watching.look(NOW)
+    assert receiver.taken == []
+    path = store.folder / "control" / "runs" / f"{run}.json"
+    begun = read_json(path)
+    write_json(path, {**begun, "process": {**begun["process"], "ticks": 1}})  # another process
+    watching.look(NOW + timedelta(seconds=3))
+    run_records.end(store.folder, run, "CRASHED", "its process was killed", "next start")
+    watching.look(NOW + timedelta(seconds=6))
+    assert receiver.taken == ["nightly: its process is gone"]
+
+
+def test_a_grade_that_fell_between_two_looks_is_told(tmp_path: Path) -> None:
+    tiny = campaign(tmp_path / "s", "tiny")
+    store, receiver = Store.open(tmp_path / "s"), Receiver()
+    began = datetime.now().astimezone() - timedelta(minutes=1)
+    watching, _ = watcher(store, [receiver], began)
+    for number, grade in enumerate(("digital input", "host time", "digital input")):
+        folder = commit(tiny, f"t{number}")
+        record = read_json(folder / RECORD)
+        record["clocks"]["arm"]["grade"] = grade
+        write_json(folder / RECORD, record)
+        os.utime(folder, ns=(0, time.time_ns() + number))
+    now = datetime.now().astimezone()
+    watching.look(now)
+    watching.look(now + timedelta(seconds=3))
+    assert len(receiver.taken) == 1
+    assert "fell from digital input to host time with trial t1" in receiver.taken[0]
+
+
+def test_a_summary_that_was_missed_is_sent_later_that_day(tmp_path: Path) -> None:
+    store, receiver = Store.create(tmp_path / "s"), Receiver()
+    watcher(store, [receiver], NOW - timedelta(days=2))  # alerts began then
+    watching, _ = watcher(store, [receiver], summary="07:30")
+    watching.look(NOW)
+    watching.look(NOW + timedelta(minutes=5))
+    assert len(receiver.taken) == 1
+
+
+def test_each_kind_reaches_a_web_and_a_mail_server_within_ten_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store.create(tmp_path / "s")
+    with http_server() as (web, posted), mail_server() as (port, mails):
+        mail = f"mailto://127.0.0.1:{port}/?from=lab@example.org&to=anna@example.org"
+        targets: list[Target] = [AppriseTarget(f"json://127.0.0.1:{web}"), AppriseTarget(mail)]
+        now = datetime.now().astimezone()
+        watching = AlertWatcher(store, settings(), targets, now, lambda text: None)
+        monkeypatch.setattr(
+            "sliplab.plugins.alerts.watcher.events",
+            lambda *about: [Event(kind, kind, f"text of {kind}", now) for kind in KINDS],
+        )
+        began = time.monotonic()
+        while not (posted and mails) and time.monotonic() - began < 10:
+            watching.look(now)
+        assert time.monotonic() - began < 10
+        watching.look(now + timedelta(minutes=1))
+    for kind in KINDS:
+        assert f"text of {kind}" in posted[0]["message"]
+        assert f"text of {kind}" in mails[0].replace("=\r\n", "")
+    assert (len(posted), len(mails)) == (1, 1)
+
+
 def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
     store = Store.create(tmp_path / "s")
     receiver = Receiver()
@@ -275,6 +383,20 @@ def test_a_file_of_schedules_may_hold_the_alerts(tmp_path: Path) -> None:
     path = tmp_path / "schedules.yaml"
     path.write_text("timezone: UTC\nschedules: []\nalerts: {to: ['json://localhost']}\n")
     assert load_alerts(path).to == ["json://localhost"]
+
+
+def test_a_rig_file_may_hold_the_alerts_and_its_copy_does_not(tmp_path: Path) -> None:
+    path, plain = tmp_path / "rig.yaml", (ROOT / "rigs" / "mock.yaml").read_text()
+    path.write_text(f"{plain}\nalerts:\n  to: ['mailto://lab:hunter2@example.org']\n")
+    assert has_alerts(path)
+    assert load_alerts(path).to == ["mailto://lab:hunter2@example.org"]
+    _, text = load_rig_file(path)
+    copy = mask_secrets(text)
+    assert "hunter2" not in copy
+    assert same_rig(copy, text)
+    assert same_rig(plain, text)
+    path.write_text(copy)
+    assert load_rig_file(path, stored=True)[0].alerts == "****"
 
 
 @contextmanager
