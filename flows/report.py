@@ -55,7 +55,7 @@ def report_flow(argument: Opaque[tuple[Problem, str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
         page = problem.page(_planned_bytes, step_seconds(store))
-        write_figures(folder, page.sections, simulated=page.simulated)
+        write_figures(folder, page.figures, simulated=page.simulated)
         write_text(folder / "index.html", page.html)
     conditions = {
         (item.name, trial.id): item.describe(trial)
