@@ -38,6 +38,7 @@ from sliplab.storage.schema.classes import (
     LengthShare,
 )
 from sliplab.storage.schema.evaluation import Share
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store
 
@@ -105,6 +106,18 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
             network=agreeing(campaigns)[0].settings.training.seeds, chosen=evaluation.seed
         ),
     )
+
+
+def class_numbers(store: Store) -> Json:
+    """Return the numbers of the evaluation under the report's keys, without a report.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    return {
+        "simulated": store.simulated,
+        "classes": class_evaluation_of(store).scores.to_json(),
+    }
 
 
 def _origin(item: Collected) -> DataOrigin:

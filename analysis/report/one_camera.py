@@ -106,7 +106,10 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
         inputs.append([judged.evaluation.key])
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
-    plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
+    plans = [
+        [item.title, item.question, item.planned.collection_hash, len(item.campaign.quarantined())]
+        for item in campaigns
+    ]
     besides = [*sections_key(store, campaigns), *registration_key(store, campaigns)]
     return make_key("report, one camera", VERSION, [inputs, plans, *besides], None)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import sliplab
@@ -402,10 +403,20 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
 
 
 def test_scores_have_every_trial_with_its_condition(store: Store) -> None:
-    scores = sliplab.open_store(store.folder).scores()
+    opened = sliplab.open_store(store.folder)
+    scores = opened.scores()
     outcomes = scores[scores.figure == "outcome.detected_first"]
     assert outcomes.trial.tolist() == [row.trial for row in read_summary(store).trials]
     assert (outcomes.condition != "").all()
+
+    keys = ["figure", "campaign", "experiment", "split", "condition", "trial", "detector"]
+    shutil.move(store.folder / "report" / "scores.parquet", store.folder / "kept")
+    early = opened.scores()  # of the evaluation
+    shutil.move(store.folder / "kept", store.folder / "report" / "scores.parquet")
+    assert 200 < len(early) < len(scores)
+    assert set(early.trial) == set(scores.trial)
+    both = early.merge(scores, how="left", on=keys, suffixes=("", "_reported"))
+    pd.testing.assert_series_equal(both.value, both.value_reported, check_names=False)
 
 
 def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:
