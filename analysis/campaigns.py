@@ -90,6 +90,17 @@ class Collected:
         return self.plan.protocol.collection.experiment
 
     @property
+    def title(self) -> str:
+        """The protocol's or data set's title; the name of a campaign without one."""
+        source = self.plan.protocol if self.recorded is None else self.recorded.adapter
+        return source.title or self.name
+
+    @property
+    def question(self) -> str:
+        """The protocol's question; empty without one."""
+        return self.plan.protocol.question if self.recorded is None else ""
+
+    @property
     def settings(self) -> AnalysisSettings:
         """The `analysis:` section."""
         if self.recorded is not None:

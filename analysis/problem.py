@@ -39,7 +39,8 @@ from sliplab.analysis.networks.models import (
     wanted_models,
 )
 from sliplab.analysis.report import pages
-from sliplab.analysis.report.classes import class_report_key
+from sliplab.analysis.report.classes import class_numbers, class_report_key
+from sliplab.analysis.report.summary import evaluation_numbers
 from sliplab.analysis.trial_work import EachTrial, KeepTrials, in_order
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.displacement import MarkerSamples, load_marker_samples
@@ -50,6 +51,7 @@ from sliplab.protocols.plugins import import_foreign
 from sliplab.storage.files import write_bytes, write_json
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import StoreError
 
 Job = evaluation.EvaluationJob | class_scores.ClassJob | markers.MarkerJob
@@ -161,6 +163,14 @@ class Problem(ABC):
         Raises:
             StoreError: there are no windows of events.
         """
+
+    def numbers(self) -> Json:
+        """Return the numbers of the evaluation, under the keys of the report's.
+
+        Raises:
+            StoreError: there is no evaluation of this version.
+        """
+        return evaluation_numbers(self.labels.store, self.campaigns)
 
     def report_key(self) -> str:
         """Return the key of all inputs of the report.
@@ -358,6 +368,10 @@ class ClassesOfRecordings(EventProblem):
     def baselines(self) -> baselines.Methods:
         """See `Problem`."""
         return baselines.class_methods(self.campaigns, len(self.classes()))
+
+    def numbers(self) -> Json:
+        """See `Problem`."""
+        return class_numbers(self.labels.store)
 
     def report_key(self) -> str:
         """See `Problem`."""

@@ -319,11 +319,17 @@ class Store:
     def scores(self) -> pd.DataFrame:
         """The figures of the last report and its trials' results, a row each (docs/summary.md).
 
+        Before a first report those of the evaluation.
+
         Raises:
-            StoreError: there is no report yet, or it is of an older version.
+            StoreError: there is neither yet, or it is of an older version.
         """
         import pandas as pd
 
+        evaluated = self.folder / "derived" / "evaluation" / "scores.parquet"
+        reported = self.folder / "report" / "scores.parquet"
+        if evaluated.exists() and not reported.exists():
+            return pd.read_parquet(evaluated)
         return pd.read_parquet(self._reported("scores.parquet"))
 
     def status(self) -> StoreStatus:

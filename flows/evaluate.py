@@ -13,8 +13,10 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import STEP
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.problem import Job, Problem, Workers, problem_of
+from sliplab.analysis.report.scores import FILE
 from sliplab.flows.judge_network import judge, spike_keeper
 from sliplab.flows.label import report_states
+from sliplab.flows.report import write_scores
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
@@ -36,6 +38,8 @@ def evaluate(
 ) -> StepResult:
     """Evaluate if any input or setting changed; also the network that `analysis.also` names.
 
+    The numbers are written as a table of scores, too.
+
     Args:
         margin, smoothing: instead of the protocols' own, and of what these would choose.
         cluster: what counts spikes and makes samples, instead of this machine.
@@ -49,6 +53,9 @@ def evaluate(
         run(evaluate_flow, Opaque((problem, job, cluster)), cluster)
     for other in problem.others():
         stale |= judge(other, cluster)
+    folder = Derived.of(store, STEP).folder
+    if stale or not (folder / FILE).exists():
+        write_scores(problem, problem.numbers(), folder)
     return {
         "step": "evaluate",
         "done": int(stale),

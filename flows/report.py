@@ -24,6 +24,7 @@ from sliplab.flows.steps import StepResult
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json, write_json, write_text
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.catalogue import write_table
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -55,16 +56,21 @@ def report_flow(argument: Opaque[tuple[Problem, str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
         page = problem.page(_planned_bytes, step_seconds(store))
-        write_figures(folder, page.sections, simulated=page.simulated)
+        write_figures(folder, page.figures, simulated=page.simulated)
         write_text(folder / "index.html", page.html)
+    write_scores(problem, page.numbers, folder)
+    write_json(folder / SUMMARY, {**page.numbers, "timing_s": step_seconds(store)})
+    Derived.of(store, STEP).write(STEP, key, {})
+
+
+def write_scores(problem: Problem, numbers: Json, folder: Path) -> None:
+    """Write a table of scores, with the condition of each trial."""
     conditions = {
         (item.name, trial.id): item.describe(trial)
         for item in problem.campaigns
         for trial, _ in item.trials
     }
-    write_table(scores.score_table(page.numbers, conditions), folder / scores.FILE)
-    write_json(folder / SUMMARY, {**page.numbers, "timing_s": step_seconds(store)})
-    Derived.of(store, STEP).write(STEP, key, {})
+    write_table(scores.score_table(numbers, conditions), folder / scores.FILE)
 
 
 def _planned_bytes(item: Collected) -> int:

@@ -399,6 +399,8 @@ class Protocol(StrictModel):
     """Version of the file format."""
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
     title: Annotated[str, Field(max_length=200)] = ""
+    question: Annotated[str, Field(max_length=300)] = ""
+    """What the campaign is to answer; the report begins with it."""
     collection: Collection
     analysis: AnalysisSettings = AnalysisSettings()
 

@@ -15,16 +15,10 @@ from sliplab.analysis.evaluation.classes import SPLITS, class_evaluation_of
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report.cover import Answer, Cover
 from sliplab.analysis.report.figures import classes as figures
 from sliplab.analysis.report.figures import intervals
-from sliplab.analysis.report.page import (
-    Content,
-    Figure,
-    Number,
-    Table,
-    percent,
-    render_page,
-)
+from sliplab.analysis.report.page import Content, Figure, Number, Table, percent
 from sliplab.analysis.report.sources import VERSION
 from sliplab.analysis.report.summary import package_versions, protocol_hashes
 from sliplab.analysis.report.windows import (
@@ -44,6 +38,7 @@ from sliplab.storage.schema.classes import (
     LengthShare,
 )
 from sliplab.storage.schema.evaluation import Share
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store
 
@@ -113,6 +108,18 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
     )
 
 
+def class_numbers(store: Store) -> Json:
+    """Return the numbers of the evaluation under the report's keys, without a report.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    return {
+        "simulated": store.simulated,
+        "classes": class_evaluation_of(store).scores.to_json(),
+    }
+
+
 def _origin(item: Collected) -> DataOrigin:
     records = [recording.record for _, recording in item.trials]
     unknown = Counter(
@@ -128,9 +135,45 @@ def _origin(item: Collected) -> DataOrigin:
     )
 
 
-def headline(summary: ClassSummary) -> list[Number]:
-    """Return the numbers on top of the page."""
+def class_cover(summary: ClassSummary) -> Cover:
+    """Return the first screen."""
     scores = summary.classes
+    return Cover("classes.html", _answer(summary), (), _headline(scores))
+
+
+def _answer(summary: ClassSummary) -> Answer:
+    """Compare the network with guessing and with other methods."""
+    scores = summary.classes
+    rows = [intervals.ShareInterval("network, windows", *_share(scores.by_length[-1]))]
+    if _several(scores):
+        rows.append(intervals.ShareInterval("network, recordings", *_share(scores.trials.argmax)))
+    rows += [
+        intervals.ShareInterval(METHODS[name], row.argmax, None, None)
+        for name, row in {**scores.beside, **scores.trained_baselines}.items()
+    ]
+    svg = intervals.shares(
+        {"test recordings": rows},
+        "argmax accuracy (%)",
+        simulated=summary.simulated,
+        line=(_chance(scores), "guessing"),
+    )
+    return Answer(
+        (
+            f"{_argmax_words(scores)} of test windows and {share_words(scores.trials.argmax)} of "
+            f"test recordings have the right one of {len(scores.classes)} classes.",
+        ),
+        Figure(svg, name="answer", data=share_data(rows, "argmax accuracy")),
+        "Accuracy on the test recordings, a tie shared among its classes; bars are 95 % intervals "
+        "over recordings.",
+    )
+
+
+def _share(row: Share) -> tuple[float | None, float | None, float | None]:
+    return row.share, row.low, row.high
+
+
+def _headline(scores: JudgedClasses) -> list[Number]:
+    """Return the numbers below the first screen."""
     methods = {**scores.beside, **scores.trained_baselines}
     known = {name: row for name, row in methods.items() if row.argmax is not None}
     found = [
@@ -443,6 +486,7 @@ class ClassMadeSection(Content):
     """Settings, versions, hashes, and the commands that make the results again."""
 
     template: ClassVar[str] = "class_made.html"
+    folded: ClassVar[bool] = True
     seeds: ClassSeeds
     settings: Table
     commands: Table
@@ -512,16 +556,3 @@ def class_sections(
         _made_section(store, campaigns, summary, fitted),
     ]
     return [section for section in sections if section is not None]
-
-
-def render(
-    campaigns: Sequence[Collected], summary: ClassSummary, sections: Sequence[Content]
-) -> str:
-    """Render the page."""
-    return render_page(
-        "classes.html",
-        sections,
-        simulated=summary.simulated,
-        campaigns=[item.name for item in campaigns],
-        headline=headline(summary),
-    )

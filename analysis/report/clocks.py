@@ -99,6 +99,7 @@ class ClockSection(Content):
     """
 
     template: ClassVar[str] = "clocks.html"
+    folded: ClassVar[bool] = True
     sync: Sync
     figure: Figure | None
     page: str | None

@@ -62,6 +62,7 @@ class DetectorSection(Content):
     """
 
     template: ClassVar[str] = "detectors.html"
+    folded: ClassVar[bool] = True
     trials: PartTrials
     smoothing: int
     best: Best | None

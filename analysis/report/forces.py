@@ -38,6 +38,7 @@ class ForceSection(Content):
     """
 
     template: ClassVar[str] = "forces.html"
+    folded: ClassVar[bool] = True
     condition: str
     friction: float
     uncertainty_ms: float

@@ -69,6 +69,11 @@ class HoldoutSection(Content):
     seeds: str
     table: Table | None
 
+    @property
+    def unmeasured(self) -> bool:
+        """True where it was not measured."""
+        return self.holdout is None
+
 
 def holdout_section(
     holdout: HoldoutSummary | None, kinematic: Kinematic, command: str, file: str

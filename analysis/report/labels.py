@@ -38,6 +38,7 @@ class LabelSection(Content):
     """
 
     template: ClassVar[str] = "labels.html"
+    folded: ClassVar[bool] = True
     source: str
     ruling: str
     papillae: ChangePointCoverage | None

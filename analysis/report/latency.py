@@ -22,7 +22,6 @@ from sliplab.analysis.report.outcomes import (
     times,
 )
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
-from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,
@@ -43,6 +42,11 @@ NAMES = {
     "latency_incipient_ms": "incipient latency",
     "latency_gross_ms": "gross latency",
     "lead_ms": "lead",
+}
+EXPERIMENTS = {
+    "kinematic": "Slides",
+    "gravity": "Plates that slip by their own weight",
+    "disturbance": "Plates that slip while the sensor is pulled sideways",
 }
 STATISTICS = {
     "n": "n",
@@ -88,8 +92,6 @@ class LatencySection(Content):
     experiment: str
     numbers: Experiment
     smallest: str
-    paper: Mapping[str, Published]
-    paper_std_ms: float
     by: Sequence[str]
     late: Sequence[tuple[str, int, float, float]]
     choices: Sequence[str]
@@ -147,8 +149,6 @@ def latency_section(
         experiment,
         numbers,
         smallest_lead(summary, experiment),
-        PAPER,
-        DISTURBANCE_LEAD_STD_MS,
         by,
         late,
         sorted({choice_note(rule) for rule in rules} - {""}),
@@ -205,7 +205,6 @@ def _figures(
     experiment: str, found: Conditions, by: Sequence[str], simulated: bool
 ) -> list[Figure]:
     """Draw the experiment's times by condition."""
-    value = {name: known.value for name, known in PAPER.items()}
     if experiment == "kinematic":
         groups, breaks = {"all test trials": found.trials}, []
         for factor in by:
@@ -213,38 +212,37 @@ def _figures(
             groups |= {
                 f"{factor} {text}": found.at(**{factor: text}) for text in found.factors[factor]
             }
-        lines = {
-            "latency_incipient_ms": (value["incipient_latency"], "paper's mean, 88 ms"),
-            "latency_gross_ms": (value["gross_latency"], "paper's mean, 70 ms"),
-        }
-        return [_draw(groups, TIMES[1:3], breaks, lines, "latency-kinematic", simulated)]
+        return [draw_times(groups, TIMES[1:3], breaks, "latency-kinematic", simulated)]
     groups, breaks = found.cells(by), found.breaks(by)
     if experiment == "disturbance":
-        line = {"lead_ms": (value["disturbance_lead"], "paper's mean")}
-        return [_draw(groups, TIMES[1:], breaks, line, "disturbance", simulated)]
-    line = {"lead_ms": (value["gravity_lead"], "paper's smallest, 360 ms")}
+        return [draw_times(groups, TIMES[1:], breaks, "disturbance", simulated)]
     return [
-        _draw(groups, TIMES[:2], breaks, {}, "gravity-incipient", simulated),
-        _draw(groups, TIMES[2:], breaks, line, "gravity-gross", simulated),
+        draw_times(groups, TIMES[:2], breaks, "gravity-incipient", simulated),
+        draw_times(groups, TIMES[2:], breaks, "gravity-gross", simulated),
     ]
 
 
-def _draw(
+def draw_times(
     groups: Mapping[str, Sequence[TrialOutcome]],
     shown: Sequence[str],
     breaks: Sequence[int],
-    lines: Mapping[str, tuple[float | None, str]],
     name: str,
     simulated: bool,
 ) -> Figure:
+    """Draw times of trials, a panel each.
+
+    Args:
+        groups: trials by the name of their row.
+        shown: which of `TIMES`.
+        breaks: rows that begin a new group.
+        name: of the figure.
+    """
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]
-        value, stated = lines.get(time, (None, ""))
-        published = None if value is None else (value, stated)
         values = {row: times(found, time) for row, found in groups.items()}
         notes = {row: _lacking(found, time) for row, found in groups.items()}
-        panels.append(Panel(label, values, colour, zero, published, notes, LEAST[time]))
+        panels.append(Panel(label, values, colour, zero, notes, LEAST[time]))
     svg = by_condition(list(groups), panels, simulated=simulated, breaks=breaks)
     trials = [(row, trial) for row, found in groups.items() for trial in found]
     data: dict[str, list[object]] = {

@@ -15,6 +15,7 @@ from sliplab.analysis.labels import label_errors
 from sliplab.analysis.labels.reviewed import StoreLabels as KeptLabels
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.campaign import collected_section, quality_section, references_of
+from sliplab.analysis.report.cover import Cover, quality_notices, slip_answer
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.marker_network import (
@@ -23,14 +24,7 @@ from sliplab.analysis.report.marker_network import (
     read_judged,
     with_classifier,
 )
-from sliplab.analysis.report.page import (
-    Content,
-    Figure,
-    Number,
-    Table,
-    number,
-    render_page,
-)
+from sliplab.analysis.report.page import Content, Figure, Number, Rendered, Table, number
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.analysis.report.skins import skin_section
@@ -95,7 +89,10 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
         inputs.append([judged.evaluation.key])
     if is_evaluated(store, campaigns):
         inputs.append([report_key(store, campaigns)])
-    plans = [[item.planned.collection_hash, len(item.campaign.quarantined())] for item in campaigns]
+    plans = [
+        [item.title, item.question, item.planned.collection_hash, len(item.campaign.quarantined())]
+        for item in campaigns
+    ]
     besides = [*sections_key(store, campaigns), *registration_key(store, campaigns)]
     return make_key("report, one camera", VERSION, [inputs, plans, *besides], None)
 
@@ -163,10 +160,9 @@ def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
     return worst
 
 
-def headline(summary: OneCameraSummary) -> list[Number]:
-    """Return the numbers on top of the page."""
-    quality = summary.quality
-    found = [Number("trials committed", str(quality.committed), f"of {quality.planned} planned")]
+def one_camera_cover(summary: OneCameraSummary) -> Cover:
+    """Return the first screen."""
+    found = []
     if (labels := summary.labels) is not None:
         both = labels.rules_ms.apart
         found.append(
@@ -189,7 +185,7 @@ def headline(summary: OneCameraSummary) -> list[Number]:
         )
         value = number(summary.clocks_us.get(device), 1, "µs")
     found.append(Number("clock uncertainty", value, f"worst trial, {device}"))
-    return found
+    return Cover("report.html", slip_answer(summary), quality_notices(summary.quality), found)
 
 
 @dataclass(frozen=True)
@@ -202,12 +198,18 @@ class LeftOutSection(Content):
     """The onsets came with the recordings."""
     steps: Table
 
+    @property
+    def notices(self) -> list[str]:
+        """Steps that are left out."""
+        return [f"{name}: {reason}" for name, reason in self.steps.rows]
+
 
 @dataclass(frozen=True)
 class OwnClocks(Content):
     """Clocks of devices, where there are no events to hold them against."""
 
     template: ClassVar[str] = "own_clocks.html"
+    folded: ClassVar[bool] = True
     clocks: Table
 
 
@@ -239,19 +241,19 @@ def one_camera_sections(
     campaigns: list[Collected],
     summary: OneCameraSummary,
     judged: EvaluatedClassifier | None = None,
-) -> list[Content]:
+) -> list[Content | Rendered]:
     """Make all sections, in order."""
     simulated = summary.simulated
-    sections: list[Content | None] = [
-        left_out_section(summary),
+    sections: list[Content | Rendered | None] = [left_out_section(summary)]
+    if judged is not None:
+        sections += marker_sections(store, campaigns, summary, judged)
+    sections += [
         collected_section(campaigns, summary),
         registration_section(store, campaigns),
         *plugin_sections(ReportData(store, campaigns, simulated, summary)),
         quality_section(campaigns, summary.references, simulated=simulated),
         skin_section(campaigns),
     ]
-    if judged is not None:
-        sections += marker_sections(store, campaigns, summary, judged)
     if summary.labels is not None:
         distances = label_errors.distances(store, campaigns)
         sections.append(label_section(store, campaigns, summary, distances))
@@ -268,19 +270,6 @@ def one_camera_sections(
         ]
         sections.append(OwnClocks(Table(("clock", "timed by", "uncertainty (µs)"), rows)))
     return [section for section in sections if section is not None]
-
-
-def render(
-    campaigns: Sequence[Collected], summary: OneCameraSummary, sections: Sequence[Content]
-) -> str:
-    """Render the page."""
-    return render_page(
-        "report.html",
-        sections,
-        simulated=summary.simulated,
-        campaigns=[item.name for item in campaigns],
-        headline=headline(summary),
-    )
 
 
 def _rates(

@@ -53,6 +53,7 @@ class OnsetSection(Content):
     """
 
     template: ClassVar[str] = "onsets.html"
+    folded: ClassVar[bool] = True
     own: Mapping[str, OnsetFigures]
     explained: Sequence[Explained]
     allowed: int | None

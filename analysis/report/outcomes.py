@@ -212,6 +212,14 @@ class FailureSection(Content):
     table: Table
     store: str
 
+    @property
+    def notices(self) -> list[str]:
+        """How many trials failed, and how."""
+        if not self.failed:
+            return []
+        causes = "; ".join(f"{count} {text}" for text, count in self.causes)
+        return [f"{self.failed} of {self.judged} evaluated trials failed: {causes}"]
+
 
 def failure_section(folder: Path, trials: Sequence[TrialOutcome]) -> FailureSection:
     """List the failures of a store, each with the command that shows it."""

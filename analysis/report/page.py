@@ -95,6 +95,18 @@ class Content:
 
     template: ClassVar[str | Path]
     """The section's file in `templates/sections` by name, or a plug-in's file."""
+    folded: ClassVar[bool] = False
+    """It stands closed, for those who look for it."""
+
+    @property
+    def unmeasured(self) -> bool:
+        """True if nothing was measured: only the command that would do it is shown, folded."""
+        return False
+
+    @property
+    def notices(self) -> Sequence[str]:
+        """What failed or is missing, for the first screen."""
+        return ()
 
     def all_figures(self) -> Iterable[Figure]:
         """Every figure among the values."""
@@ -105,12 +117,19 @@ class Content:
 
 
 @dataclass(frozen=True)
-class Rendered(Content):
-    """A section that is HTML already."""
+class Rendered:
+    """A section as HTML; the other values are those of its `Content`."""
 
     title: str
     html: Markup
     figures: Sequence[Figure]
+    folded: bool
+    unmeasured: bool
+    notices: Sequence[str]
+
+    def all_figures(self) -> Iterable[Figure]:
+        """Every figure in it."""
+        return self.figures
 
 
 @cache
@@ -130,7 +149,11 @@ def _environment(folder: Path | None = None) -> Environment:
 
 
 def render_page(
-    template: str | Path, sections: Sequence[Content] = (), *, simulated: bool, **values: object
+    template: str | Path,
+    sections: Sequence[Content | Rendered] = (),
+    *,
+    simulated: bool,
+    **values: object,
 ) -> str:
     """Render a page of sections under the top that `template` and its `values` give it.
 
@@ -140,7 +163,10 @@ def render_page(
         template: a file of `templates` by name, or a plug-in's file, which includes others of its
             folder as ``own/NAME``.
     """
-    rendered = [render_section(section, simulated=simulated) for section in sections]
+    rendered = [
+        section if isinstance(section, Rendered) else render_section(section, simulated=simulated)
+        for section in sections
+    ]
     return _template(template).render(sections=rendered, simulated=simulated, **values)
 
 
@@ -151,23 +177,28 @@ def _template(file: str | Path) -> Template:
     return _environment().get_template(file)
 
 
-def render_section(content: Content, *, simulated: bool) -> tuple[str, Markup]:
-    """Render one section: its title, and its HTML."""
-    if isinstance(content, Rendered):
-        return content.title, content.html
+def render_section(content: Content, *, simulated: bool) -> Rendered:
+    """Render one section."""
     file = content.template
     template = _template(file if isinstance(file, Path) else f"sections/{file}")
     module: Any = template.make_module({"v": content, "simulated": simulated})
-    return module.title, Markup(str(module))
+    return Rendered(
+        str(module.title),
+        Markup(str(module)),
+        list(content.all_figures()),
+        content.folded,
+        content.unmeasured,
+        content.notices,
+    )
 
 
-def write_figures(folder: Path, sections: Sequence[Content], *, simulated: bool) -> None:
+def write_figures(folder: Path, figures: Sequence[Figure], *, simulated: bool) -> None:
     """Write each named figure and its data as separate files; those of an older page go.
 
     Raises:
         ValueError: two figures of one name.
     """
-    named = [figure for section in sections for figure in section.all_figures() if figure.name]
+    named = [figure for figure in figures if figure.name]
     if len({figure.name for figure in named}) < len(named):
         raise ValueError(f"two figures of one name among {[figure.name for figure in named]}")
     retained: set[Path] = set()

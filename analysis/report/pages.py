@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.report import classes, one_camera, report
+from sliplab.analysis.report.cover import Cover
 from sliplab.analysis.report.marker_network import read_judged
+from sliplab.analysis.report.page import Content, Figure, Rendered
 from sliplab.analysis.report.sources import read_sources, report_key
 from sliplab.analysis.report.summary import make_summary
 from sliplab.storage.schema.summary import OneCameraSummary
@@ -23,11 +24,11 @@ class Page:
 
     Attributes:
         numbers: of the summary.
-        sections: whose figures are written as files, too.
+        figures: those with a name are written as files, too.
     """
 
     numbers: Json
-    sections: Sequence[Any]
+    figures: Sequence[Figure]
     html: str
     simulated: bool
 
@@ -43,8 +44,7 @@ def class_page(store: Store, campaigns: list[Collected], model: ModelOnDisk) -> 
     """
     summary = classes.class_summary(store, campaigns)
     sections = classes.class_sections(store, campaigns, summary, model)
-    html = classes.render(campaigns, summary, sections)
-    return Page(summary.to_json(), sections, html, summary.simulated)
+    return _page(campaigns, summary.to_json(), classes.class_cover(summary), sections)
 
 
 def slip_report_key(store: Store, campaigns: list[Collected]) -> str:
@@ -79,8 +79,7 @@ def slip_page(
     if one_camera.is_evaluated(store, campaigns):
         return _evaluated(store, campaigns, planned, seconds, shown)
     sections = one_camera.one_camera_sections(store, campaigns, shown, judged)
-    html = one_camera.render(campaigns, shown, sections)
-    return Page(shown.to_json(), sections, html, shown.simulated)
+    return _page(campaigns, shown.to_json(), one_camera.one_camera_cover(shown), sections)
 
 
 def _evaluated(
@@ -104,5 +103,18 @@ def _evaluated(
         sections = [one_camera.left_out_section(without_frames), *sections]
         sections += [] if rates is None else [rates]
         numbers = without_frames.to_json() | numbers
-    html = report.render(sources, summary, sections)
-    return Page(numbers, sections, html, summary.simulated)
+    return _page(campaigns, numbers, report.report_cover(summary), sections)
+
+
+def _page(
+    campaigns: Sequence[Collected],
+    numbers: Json,
+    cover: Cover,
+    sections: Sequence[Content | Rendered],
+) -> Page:
+    """Render the page."""
+    simulated = bool(numbers["simulated"])
+    html = cover.render(campaigns, sections, simulated=simulated)
+    figures = [figure for section in sections for figure in section.all_figures()]
+    figures += [] if cover.answer.figure is None else [cover.answer.figure]
+    return Page(numbers, figures, html, simulated)

@@ -11,6 +11,7 @@ from sliplab.analysis.report.page import Content, Figure, Rendered, csv_text, re
 from sliplab.protocols.hashing import hash_data
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
+from sliplab.protocols.shown import plural
 from sliplab.storage.files import safe_name
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.trials.store import Store
@@ -64,8 +65,13 @@ class LostSections(Content):
     template: ClassVar[str] = "lost_sections.html"
     faults: Sequence[str]
 
+    @property
+    def notices(self) -> list[str]:
+        """How many there are."""
+        return [f"{plural(len(self.faults), 'section')} could not be made"]
 
-def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content]:
+
+def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content | Rendered]:
     """Make the sections of plug-ins, in the order of the plug-ins' names; then what is lost.
 
     Args:
@@ -115,10 +121,9 @@ def _rendered(name: str, section: ReportSection, data: ReportData) -> Rendered |
     content = section.make(data)
     if content is None:
         return None
-    title, html = render_section(content, simulated=data.simulated)
-    figures = [figure for figure in content.all_figures() if figure.name]
-    _check(figures, name, data.simulated)
-    return Rendered(str(title), html, figures)
+    made = render_section(content, simulated=data.simulated)
+    _check([figure for figure in made.figures if figure.name], name, data.simulated)
+    return made
 
 
 def _check(figures: Sequence[Figure], section: str, simulated: bool) -> None:

@@ -13,6 +13,7 @@ from sliplab.analysis.registration import RegistrationDeviation, campaign_deviat
 from sliplab.analysis.report.page import Content, Table
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data
+from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import sha256
 from sliplab.storage.trials.registration import (
@@ -50,8 +51,19 @@ class RegistrationSection(Content):
     """
 
     template: ClassVar[str] = "registration.html"
+    folded: ClassVar[bool] = True
     campaigns: Sequence[Registered]
     absent: Sequence[str]
+
+    @property
+    def notices(self) -> list[str]:
+        """How far each campaign deviates from its registration."""
+        counts = {it.name: len(it.deviations.rows) for it in self.campaigns}
+        return [
+            f"{name}: {plural(count, 'deviation')} from its registration"
+            for name, count in counts.items()
+            if count
+        ]
 
 
 def registration_key(store: Store, campaigns: list[Collected]) -> list[str]:

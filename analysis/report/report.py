@@ -1,4 +1,4 @@
-"""The report: its sections in order, and the numbers on top of it."""
+"""The report: its first screen, and its sections in order."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
+from sliplab.analysis.report.cover import Cover, quality_notices, slip_answer
 from sliplab.analysis.report.detectors import detector_section
 from sliplab.analysis.report.forces import force_section
 from sliplab.analysis.report.holdout import holdout_section
@@ -22,13 +23,7 @@ from sliplab.analysis.report.labels import label_section
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.onsets import onset_section
 from sliplab.analysis.report.outcomes import failure_section
-from sliplab.analysis.report.page import (
-    Content,
-    Number,
-    Table,
-    number,
-    render_page,
-)
+from sliplab.analysis.report.page import Content, Number, Rendered, Table, number
 from sliplab.analysis.report.paper import paper_section
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections
 from sliplab.analysis.report.programs import HOLDOUT
@@ -77,39 +72,30 @@ class ProvenanceSection(Content):
     """Hashes, wall times and versions."""
 
     template: ClassVar[str] = "provenance.html"
+    folded: ClassVar[bool] = True
     seeds: SeedsUsed
     uncertainty: str
     device: str
     tables: Sequence[Table]
 
 
-def render(sources: Sources, summary: Summary, sections: Sequence[Content]) -> str:
-    """Render the page; everything in it is escaped but the figures' SVG."""
-    names = [item.name for item in sources.campaigns]
-    return render_page(
-        "report.html",
-        sections,
-        simulated=summary.simulated,
-        campaigns=names,
-        headline=headline(summary),
-    )
-
-
-def headline(summary: Summary) -> list[Number]:
-    """Return the numbers on top of the page."""
-    quality = summary.quality
+def report_cover(summary: Summary) -> Cover:
+    """Return the first screen."""
+    notices = quality_notices(summary.quality)
+    if any(rule.choose == "test" for rule in summary.detection.values()):
+        notices.append("smoothing and margin were chosen on test trials, which flatters them")
     uncertain, device = clocks.worst_clock(summary.sync)
     note = clocks.short_note(summary.sync, summary.labels)
-    if any(rule.choose == "test" for rule in summary.detection.values()):
-        note += "; smoothing and margin chosen on test trials"
-    return [
-        Number("trials committed", str(quality.committed), f"of {quality.planned} planned"),
-        *slip_tiles(summary, f"; {note}"),
-        Number("clock uncertainty", uncertain, f"worst trial, {device}"),
+    headline = [
+        *slip_tiles(summary),
+        Number("clock uncertainty", uncertain, f"worst trial, {device}; {note}"),
     ]
+    return Cover("report.html", slip_answer(summary), notices, headline)
 
 
-def make_sections(sources: Sources, summary: Summary, shown: ReportMaterial) -> list[Content]:
+def make_sections(
+    sources: Sources, summary: Summary, shown: ReportMaterial
+) -> list[Content | Rendered]:
     """Make all sections, in order.
 
     Raises:
@@ -129,8 +115,14 @@ def make_sections(sources: Sources, summary: Summary, shown: ReportMaterial) -> 
     data = ReportData(store, campaigns, simulated, summary)
     if simulated and data.collected_here:
         holdout = holdout_section(summary.holdout, kinematic, HOLDOUT.command(store), HOLDOUT.file)
-    sections: list[Content | None] = [
-        paper_section(summary),
+    page = (store.folder / "report" / clocks.PAGE).exists()
+    sections: list[Content | Rendered | None] = [
+        latency_section("kinematic", campaigns, rows, summary),
+        latency_section("gravity", campaigns, rows, summary),
+        latency_section("disturbance", campaigns, rows, summary),
+        failure_section(store.folder, summary.trials),
+        windows.network_section(kinematic, shown.fitted, simulated=simulated),
+        windows.where_section(kinematic, simulated=simulated),
         holdout,
         collected_section(campaigns, summary),
         registration_section(store, list(campaigns)),
@@ -138,26 +130,16 @@ def make_sections(sources: Sources, summary: Summary, shown: ReportMaterial) -> 
         quality_section(campaigns, summary.references, simulated=simulated),
         skin_section(campaigns, rows),
         trial,
+        outputs,
         force_section(store, campaigns, seen, simulated=simulated),
-        windows.network_section(kinematic, shown.fitted, simulated=simulated),
-        windows.where_section(kinematic, simulated=simulated),
+        label_section(store, campaigns, summary, shown.distances),
+        clocks.clock_section(campaigns, summary.sync, page=page, simulated=simulated),
         windows.lead_section(kinematic, simulated=simulated),
         windows.work_section(kinematic),
-        outputs,
-        latency_section("kinematic", campaigns, rows, summary),
-        latency_section("gravity", campaigns, rows, summary),
-        latency_section("disturbance", campaigns, rows, summary),
-        failure_section(store.folder, summary.trials),
         detector_section(summary.detectors, simulated=simulated),
         onset_section(summary),
-        label_section(store, campaigns, summary, shown.distances),
-        clocks.clock_section(
-            campaigns,
-            summary.sync,
-            page=(store.folder / "report" / clocks.PAGE).exists(),
-            simulated=simulated,
-        ),
         *plugin_sections(data, last=True),
+        paper_section(summary),
         _provenance(summary),
     ]
     return [section for section in sections if section is not None]

@@ -176,7 +176,11 @@ def _spans(part: Mapping[str, Any]) -> dict[str, Row]:
         for time, of in part.get("intervals", {}).items()
         for name in STATISTICS
     }
-    pairs |= {f"latency_ms.{kind}.median": part.get(f"median_{kind}_ms") for kind in _ONSETS}
+    pairs |= {
+        f"latency_ms.{kind}.median": part[key]
+        for kind in _ONSETS
+        if (key := f"median_{kind}_ms") in part  # of decisions by an onset
+    }
     return {
         figure: {
             "low": -math.inf if pair[0] is None else pair[0],

@@ -33,7 +33,7 @@ from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
 STEP = "report"
-VERSION = 12
+VERSION = 13
 
 
 def report_folder(store: Store) -> Path:
@@ -81,6 +81,8 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
     collected = [
         [
             item.name,
+            item.title,
+            item.question,
             item.planned.collection_hash,
             len(item.campaign.quarantined()),
             [recording.checksum for _, recording in item.trials],

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pydantic_core import to_jsonable_python
+
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.detectors.onset_references import (
@@ -13,6 +15,9 @@ from sliplab.analysis.detectors.onset_references import (
     decisions_of,
     judge_by_reference,
 )
+from sliplab.analysis.evaluation import networks as other_networks
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.evaluation.windows import window_intervals
 from sliplab.analysis.report.alarms import OWN, false_alarms
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
@@ -41,6 +46,7 @@ from sliplab.storage.schema.summary import (
     Sync,
 )
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
 from sliplab.storage.versions import FIGURES, installed_versions
 
 Slips = Mapping[tuple[str, str], References]
@@ -124,6 +130,25 @@ def make_summary(sources: Sources) -> Summary:
             },
         }
     )
+
+
+def evaluation_numbers(store: Store, campaigns: list[Collected]) -> Json:
+    """Return the numbers of the evaluation under the report's keys, without a report.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    evaluation = evaluation_of(store)
+    spans = window_intervals(store, evaluation.key)
+    others = other_networks.retained(store, campaigns, evaluation.reviewed is not None)
+    numbers: Json = to_jsonable_python(
+        {
+            "simulated": store.simulated,
+            **judged_part(campaigns, evaluation, spans, {}, {}, {}),
+            "networks": {name: _network(campaigns, of, {}, {}) for name, of in others.items()},
+        }
+    )
+    return numbers
 
 
 def judged_part(

@@ -17,7 +17,6 @@ from sliplab.analysis.report.figures import trials as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.latency import choice_note
 from sliplab.analysis.report.page import Content, Figure
-from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
 from sliplab.protocols.detection import Detection
@@ -91,17 +90,16 @@ class TrialSection(Content):
     Attributes:
         rates: positive events a second by phase.
         tracks: the tracks in a video's place, as text; nothing where there is a video.
-        paper: the event rate that the paper shows.
         fault: that of the file from which it was salvaged; nothing for a whole trial.
     """
 
     template: ClassVar[str] = "trial.html"
+    folded: ClassVar[bool] = True
     condition: str
     rates: Mapping[str, float]
     tracks: str
     markers: bool
     """Their displacements are drawn."""
-    paper: str
     figure: Figure
     fault: str = ""
 
@@ -135,7 +133,6 @@ def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSe
         _rates(event_s, [0.0, motion_s, *onsets, (end - start) / 1e9]),
         tracks_words(simulated) if recording.frame_source == "tracks" else "",
         len(frame_ns) > 0,
-        PAPER["event_rate"].text,
         Figure(svg, name="trial", data=_data(frame_s, displacement_px, event_s, cell)),
         "" if recording.record.lost is None else recording.record.lost.reason,
     )
@@ -191,6 +188,7 @@ class OutputSection(Content):
     """
 
     template: ClassVar[str] = "outputs.html"
+    folded: ClassVar[bool] = True
     condition: str
     settings: Detection
     choice: str

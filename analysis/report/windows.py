@@ -17,7 +17,6 @@ from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.figures import windows as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
-from sliplab.analysis.report.published import PAPER, Published
 from sliplab.protocols.quantity import level_order
 from sliplab.storage.schema.classes import JudgedClasses
 from sliplab.storage.schema.evaluation import (
@@ -71,7 +70,6 @@ class NetworkSection(Content):
     strong: bool
     """Stronger methods were trained."""
     warnings: Sequence[str]
-    paper: Mapping[str, Published]
     confusion: Figure
     training: Figure
     methods: Table
@@ -81,6 +79,11 @@ class NetworkSection(Content):
     def strict(self) -> str:
         """Strict accuracy with its interval."""
         return share_words(self.interval)
+
+    @property
+    def notices(self) -> Sequence[str]:
+        """Faults of the network."""
+        return self.warnings
 
 
 def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) -> NetworkSection:
@@ -100,7 +103,6 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
         kinematic.seeds,
         bool(baselines),
         fitted.warnings,
-        PAPER,
         confusion_figure(kinematic, simulated=simulated),
         training_figure(history, fitted.chosen_epoch, simulated=simulated),
         Table(
@@ -269,6 +271,7 @@ class LeadSection(Content):
     """Share of right windows by the winner's lead in spikes."""
 
     template: ClassVar[str] = "lead.html"
+    folded: ClassVar[bool] = True
     calibration: ProbabilityCalibration
     figure: Figure
 
@@ -319,6 +322,7 @@ class WorkSection(Content):
     """
 
     template: ClassVar[str] = "work.html"
+    folded: ClassVar[bool] = True
     work: WindowWork
     seeds: Seeds
     rival: BestBaseline | None

@@ -37,6 +37,11 @@ class TradeoffSection(Content):
     tried: int = 0
     link: str = ""
 
+    @property
+    def unmeasured(self) -> bool:
+        """True where it was not measured."""
+        return self.search is None
+
 
 def tradeoff_section(store: Store, found: Json | None) -> TradeoffSection:
     """Show the search of detectors; None: there was none.

@@ -111,7 +111,7 @@ def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None
     assert "at" not in json.dumps(summary["versions"])
     page = " ".join((store.folder / "report" / "index.html").read_text().split())
     assert "Hold-out: another skin and seed" in page
-    assert "They were evaluated 1 time here" in page
+    assert "They were evaluated 1 time, by version" in page
     rows = holdout_rows(holdout_part(HoldoutResult.model_validate(kept)))
     assert rows[0][0] == "windows right, strict"
     assert rows[0][2] == f"4 trials, {summary['windows']['strict']['n']} windows"

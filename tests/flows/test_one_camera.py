@@ -228,7 +228,7 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     assert all(trial.first_slip_ms is not None for trial in found.trials)
     assert found.wear.keys() == {"first_slip_ms"}
     page = (store.folder / "report" / "index.html").read_text()
-    assert "no campaign has reference trials" not in page
+    assert "No campaign has reference trials" not in page
     assert "time to the first slip" in page
 
 

@@ -122,6 +122,8 @@ def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
     assert report(store, campaigns)["done"] == 1
     page = (store.folder / "report" / "index.html").read_text()
     assert "lab.pt (simulated)" in page
+    assert "88 ms after onset" in page
+    assert "measured by its authors on their own robot" in " ".join(page.split())
     assert "paper preset (simulated)" in page
 
 

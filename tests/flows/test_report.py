@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import sliplab
@@ -169,7 +170,7 @@ def test_trials_stand_under_their_conditions(store: Store) -> None:
 
 DRAWN = (
     *("trial", "confusion", "outputs", "latency-kinematic", "gravity-incipient", "gravity-gross"),
-    *("labels", "clocks", "quality-tiny"),
+    *("answer", "labels", "clocks", "quality-tiny"),
 )
 
 
@@ -224,11 +225,11 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
         else:
             assert (folder / address).is_file()
     for said in (
-        *("88 ms after onset", "measured by its authors on their own robot", "here (simulated)"),
         *(f"sliplab {command} {store.folder.resolve()}" for command in ("review", "generalise")),
-        "no campaign has reference trials",
+        "No campaign has reference trials",
     ):
         assert said in text
+    assert "Comparison with the paper" not in text  # no protocol asks for its preset
 
 
 def test_failures_have_a_command_that_shows_them(store: Store) -> None:
@@ -242,10 +243,10 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     assert "gross missed" in found.table.rows[0][1]
     command = f"sliplab view {store.folder.resolve()} a=1,r=1 --campaign {row.campaign}"
     assert found.table.rows[0][0] == command  # two campaigns have this trial
-    assert "2 of 3 evaluated trials failed" in render_section(found, simulated=True)[1]
+    assert "2 of 3 evaluated trials failed" in render_section(found, simulated=True).html
     many = failure_section(store.folder, [row] * (MOST_FAILURES + 1))
     assert len(many.table.rows) == MOST_FAILURES
-    assert "summary.json" in render_section(many, simulated=True)[1]
+    assert "summary.json" in render_section(many, simulated=True).html
     late = [
         changed(row, outcome="detected_first", gross="late", late_gross_ms=late_ms)
         for late_ms in (359.0, 579.4)
@@ -254,7 +255,7 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     assert grouped.causes == [("gross late", 2)]
     said = [line[1].split(", ")[1] for line in grouped.table.rows]
     assert said == [f"{late_ms} ms after it ended" for late_ms in (359, 579)]
-    none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
+    none = render_section(failure_section(store.folder, [fine]), simulated=True).html
     assert "0 of 1 evaluated trials failed in some way." in none
     assert "<table" not in none
 
@@ -316,7 +317,7 @@ def test_results_of_other_programs_are_taken_up(copied: Store) -> None:
     assert report(other, collected(other))["done"] == 1
     absent = tradeoff_section(other, None)
     assert absent.command.startswith("sliplab tradeoff ")
-    write_figures(other.folder / "report", [absent], simulated=True)
+    write_figures(other.folder / "report", list(absent.all_figures()), simulated=True)
     assert list(data.iterdir()) == []  # an older report's figures go
 
 
@@ -392,19 +393,30 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     assert section.tables[0].rows == [row]
     assert 0.0 < sd < 0.05
     words = "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
-    assert words in render_section(section, simulated=True)[1]
+    assert words in render_section(section, simulated=True).html
     steep = {"tiny": changed(known["tiny"], wear=found)}
-    said = render_section(campaign.quality_section([item], steep, simulated=True), simulated=True)
+    worn = campaign.quality_section([item], steep, simulated=True)
+    said = render_section(worn, simulated=True).html
     trend = f"changes by {slope:+.2f} % in 100 trials"
-    assert trend in " ".join(said[1].split())
-    assert "more than chance." in said[1]
+    assert trend in " ".join(said.split())
+    assert "more than chance." in said
 
 
 def test_scores_have_every_trial_with_its_condition(store: Store) -> None:
-    scores = sliplab.open_store(store.folder).scores()
+    opened = sliplab.open_store(store.folder)
+    scores = opened.scores()
     outcomes = scores[scores.figure == "outcome.detected_first"]
     assert outcomes.trial.tolist() == [row.trial for row in read_summary(store).trials]
     assert (outcomes.condition != "").all()
+
+    keys = ["figure", "campaign", "experiment", "split", "condition", "trial", "detector"]
+    shutil.move(store.folder / "report" / "scores.parquet", store.folder / "kept")
+    early = opened.scores()  # of the evaluation
+    shutil.move(store.folder / "kept", store.folder / "report" / "scores.parquet")
+    assert 200 < len(early) < len(scores)
+    assert set(early.trial) == set(scores.trial)
+    both = early.merge(scores, how="left", on=keys, suffixes=("", "_reported"))
+    pd.testing.assert_series_equal(both.value, both.value_reported, check_names=False)
 
 
 def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:

@@ -28,7 +28,6 @@ class Panel:
         values: by row, one a trial; a row without an entry stays empty.
         colour: of its dots.
         zero: the meaning of zero, as text; empty where zero has none.
-        published: a line for what the paper has, and how it is called.
         least: the smallest value that there can be.
         notes: by row, what to write at its right end, such as how many have no value.
     """
@@ -37,7 +36,6 @@ class Panel:
     values: Mapping[str, Sequence[float]]
     colour: str = BLUE
     zero: str = ""
-    published: tuple[float, str] | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
     least: float = -np.inf
 
@@ -83,12 +81,7 @@ def by_condition(
                 axes.axhline(place - 0.5, color=GREY, lw=0.4)
             if panel.zero:
                 axes.axvline(0, color=GREY, lw=0.8)
-            lines = [panel.zero and f"0: {panel.zero}"]
-            if panel.published is not None:
-                value, stated = panel.published
-                axes.axvline(value, color="black", lw=0.9, ls=":")
-                lines.append(f"dotted: {stated}")
-            axes.set_title("\n".join(line for line in lines if line), fontsize=7.5, color=GREY)
+                axes.set_title(f"0: {panel.zero}", fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)
             axes.set_xlim(*_room(panel))
@@ -109,10 +102,9 @@ def by_condition(
 
 
 def _room(panel: Panel) -> tuple[float, float]:
-    """Limits of a panel: all trials and lines; the wide interval of a few trials is cut off."""
+    """Limits of a panel: all trials; the wide interval of a few trials is cut off."""
     shown = [value for values in panel.values.values() for value in values]
     shown += [0.0] if panel.zero else []
-    shown += [] if panel.published is None else [panel.published[0]]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
     margin = 0.06 * (high - low) or 1.0
     return low - margin, high + margin

@@ -28,6 +28,11 @@ class SkinSection(Content):
     table: Table | None = None
     seeds: str = ""
 
+    @property
+    def unmeasured(self) -> bool:
+        """True where it was not measured."""
+        return self.table is None
+
 
 def skin_section(
     found: Json | None, command: str, strict: float | None, seeds: str = "", *, simulated: bool

@@ -67,8 +67,8 @@ def summary(
 
 def shown(section: OnsetSection, simulated: bool = True) -> str:
     """The section as text."""
-    title, text = render_section(section, simulated=simulated)
-    return " ".join(f"{title} {text}".split())
+    made = render_section(section, simulated=simulated)
+    return " ".join(f"{made.title} {made.html}".split())
 
 
 def test_every_decider_has_a_row_for_each_onset_and_the_sentence_adds_them_up() -> None:

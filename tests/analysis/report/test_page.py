@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
+from sliplab.analysis.report.cover import Answer, Cover
 from sliplab.analysis.report.figures import campaign, clocks, intervals, trials
 from sliplab.analysis.report.figures.intervals import (
     Panel,
@@ -18,7 +21,7 @@ from sliplab.analysis.report.figures.intervals import (
     differences,
 )
 from sliplab.analysis.report.outcomes import FailureSection
-from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
+from sliplab.analysis.report.page import Content, Figure, Table, csv_text
 from sliplab.analysis.report.trial import TrialSection
 from sliplab.plugins.studies.generalise.section import SkinSection
 from sliplab.plugins.studies.plot import AxisPair as Pair
@@ -32,7 +35,6 @@ LEAD = Panel(
     "lead (ms)",
     {ROWS[0]: [360.0, 420.0]},
     zero="gross slip",
-    published=(360.0, "paper's smallest"),
     notes={ROWS[0]: "2 missed"},
 )
 DEPTHS = [ShareInterval("2.4 mm", 0.9, 0.85, 0.95), ShareInterval("2.6 mm", None, None, None)]
@@ -44,7 +46,7 @@ WINDOWS = "windows classified correctly (%)"
 DRAWN: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "by_condition": (
         partial(by_condition, ROWS, [LEAD], breaks=[1]),
-        ("lead (ms)", *ROWS, "0: gross slip", "dotted: paper's smallest", "2 missed", "none"),
+        ("lead (ms)", *ROWS, "0: gross slip", "2 missed", "none"),
     ),
     "shares": (
         partial(intervals.shares, {"depth": DEPTHS}, WINDOWS, line=(0.92, "all")),
@@ -86,9 +88,11 @@ DRAWN: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
 }
 
 
-def render(*sections: Content, simulated: bool = False) -> str:
-    """The report's page without numbers on top."""
-    return render_page("report.html", sections, simulated=simulated, campaigns=[EVIL], headline=[])
+def render(*sections: Content, simulated: bool = False, notices: Sequence[str] = ()) -> str:
+    """A report with these sections."""
+    campaigns: Any = [SimpleNamespace(name=EVIL, title=EVIL, question=EVIL)]
+    cover = Cover("report.html", Answer([EVIL], Figure(SVG), EVIL), notices, [])
+    return cover.render(campaigns, sections, simulated=simulated)
 
 
 @pytest.mark.parametrize("name", sorted(DRAWN))
@@ -119,26 +123,39 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     figure = Figure(SVG, "name", {})
     commands = Table((EVIL, "command"), [[EVIL, f"sliplab view {EVIL}"]], commands=(1,))
     sections = (
-        TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, EVIL, figure),
+        TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, figure),
         FailureSection(1, 2, [(EVIL, 1)], 1, commands, EVIL),
         SkinSection(EVIL),
     )
-    page = render(*sections, simulated=True)
+    page = render(*sections, simulated=True, notices=[EVIL])
     assert "<img" not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") > 9
     assert SVG in page
     assert 'href="figures/name.svg"' in page
     assert 'href="data/name.csv"' in page
-    assert "Paper, on its own robot:" in page
-    assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
-    torn = render(TrialSection("a", {}, "", False, "", Figure(SVG), "is cut short"))
+    torn = render(TrialSection("a", {}, "", False, Figure(SVG), "is cut short"))
     assert "It is not whole: it was salvaged from a file that is cut short." in torn
-    plain = render(TrialSection("a", {}, "", False, "", Figure(SVG)))
+    plain = render(TrialSection("a", {}, "", False, Figure(SVG)))
     assert "not whole" not in plain
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]
     assert plain.startswith("<!doctype html>")
+
+
+def test_first_screen_names_failures_and_unmeasured_results_once() -> None:
+    none = Table((), [])
+    fine = FailureSection(0, 2, [], 1, none, "s")
+    assert "<li>Nothing.</li>" in render(fine)
+    failed = FailureSection(1, 2, [("gross late", 1)], 1, none, "s")
+    page = render(SkinSection("sliplab generalise s"), failed)
+    assert '<li><a href="#s2">1 of 2 evaluated trials failed: 1 gross late</a></li>' in page
+    assert page.count("Other skins, and levels left out") == 2  # its name and its command
+    first, rest = page.split('<a id="unmeasured"></a>')
+    assert '<a href="#unmeasured">Not measured: Other skins, and levels left out</a>' in first
+    assert "<details><summary>Other skins" in rest
+    assert "sliplab generalise s" in rest
+    assert '<section id="s1">' not in page
 
 
 def in_a_page(table: Table) -> str:

@@ -88,8 +88,9 @@ def test_section_escapes_what_it_shows(store: Store) -> None:
     campaign.update(campaign.info, f"{text}# <script>\n", "")
     section = registration_section(store, collected(store))
     assert section is not None
-    title, page = render_section(section, simulated=True)
-    assert title == "Registration, and deviations from it"
+    made = render_section(section, simulated=True)
+    page = made.html
+    assert made.title == "Registration, and deviations from it"
     assert "text of the protocol" in page
     assert "<script>" not in page
 

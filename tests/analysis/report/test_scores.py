@@ -77,7 +77,11 @@ def test_parts_of_a_key_that_are_columns_are_not_in_the_figure() -> None:
                 "by_factor": {"depth": {"2 mm": share}},
                 "seeds": {"each": [{"seed": 3, "chosen": True, "strict": 0.5, "margin": None}]},
                 "samples": {"train": 4, "test": 2},
-                "intervals": {"lead_ms": {"n": 2, "mean": [1.0, None]}},
+                "intervals": {
+                    "lead_ms": {"n": 2, "mean": [1.0, None]},
+                    "latency_incipient_ms": {"n": 2, "median": [7.0, 9.0]},
+                },
+                "latency_ms": {"incipient": {"median": 8.0, "n": 2}},
                 "lead_ms": {"mean": 2.0, "n": 2},
             },
             "networks": {"other": {"gravity": {"lead_ms": {"mean": 3.0, "n": 1}}}},
@@ -95,6 +99,8 @@ def test_parts_of_a_key_that_are_columns_are_not_in_the_figure() -> None:
     assert leads.value.tolist() == [2.0, 3.0]
     assert leads.detector.tolist() == ["", "other"]
     assert leads.high.tolist()[0] == math.inf
+    median = rows_of(table, figure="latency_ms.incipient.median").iloc[0]
+    assert (median.value, median.low, median.high) == (8.0, 7.0, 9.0)
     assert rows_of(table, campaign="pilot").unit.tolist() == ["s"]
 
 

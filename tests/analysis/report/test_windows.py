@@ -49,7 +49,7 @@ def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSect
         )
     )
     assert found is not None
-    return found, " ".join(render_section(found, simulated=True)[1].split())
+    return found, " ".join(render_section(found, simulated=True).html.split())
 
 
 def test_means_of_seeds_stand_against_each_other() -> None:

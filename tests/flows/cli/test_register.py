@@ -35,7 +35,7 @@ def section(store: Path) -> str:
     opened = Store.open(store)
     found = registration_section(opened, collected(opened))
     assert found is not None
-    return words(str(render_section(found, simulated=True)[1]))
+    return words(str(render_section(found, simulated=True).html))
 
 
 def key(store: Path) -> list[str]:

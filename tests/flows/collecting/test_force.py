@@ -15,7 +15,7 @@ from sliplab.analysis.force import force_figures, has_forces, plate_forces
 from sliplab.analysis.labels.labelling import label_results
 from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.report.forces import force_section
-from sliplab.analysis.report.page import render_page
+from sliplab.analysis.report.page import render_section
 from sliplab.flows.api import open_store
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.session import TrialCollector
@@ -287,7 +287,7 @@ def test_the_report_shows_the_forces(labelled: Store) -> None:
     section = force_section(labelled, items, None, simulated=True)
     assert section.trials == 2
     assert 0.5 < section.friction < 1.0
-    page = render_page("report.html", [section], simulated=True, campaigns=["tiny"], headline=[])
+    page = render_section(section, simulated=True).html
     assert "friction cone" in page
     assert "simulated" in section.figure.svg
     rows = {(row[0], row[1]): row for row in section.rules.rows}

@@ -79,7 +79,7 @@ def test_a_claim_stands_with_the_look_that_called_it(tmp_path: Path, small: dict
     data = shown.figure.data
     assert data["trials"] == [9, 18, 27]
     assert data["1: median latency at most 90 ms, low (ms)"] == [None, 60.0, 61.0]
-    _, text = render_section(section, simulated=True)
+    text = render_section(section, simulated=True).html
     assert "27 of 36 trials" in text
     assert "every claim is settled" in text
     assert "Claims and estimates are of conditions repeated for ever" in text
