@@ -1,0 +1,63 @@
+"""The web application: its subjects, one module each, behind the gate."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from sliplab.flows.web import log
+from sliplab.flows.web.access import COOKIE, NAME_COOKIE, Gate, set_cookie
+from sliplab.flows.web.web import form
+
+if TYPE_CHECKING:
+    from sliplab.flows.web.web import Web
+
+SUBJECTS = (log.routes,)
+
+
+def application(web: Web) -> Starlette:
+    """Return the application of one store. `SameOrigin` must be in front of it."""
+    routes: list[BaseRoute] = [
+        Route("/enter", _enter(web)),
+        Route("/name", _name, methods=["POST"]),
+        Mount("/static", StaticFiles(directory=Path(__file__).with_name("static"))),
+    ]
+    for subject in SUBJECTS:
+        routes += subject(web)
+    entry = web.templates.get_template("enter.html").render()
+    return Starlette(routes=routes, middleware=[Middleware(Gate, access=web.access, entry=entry)])
+
+
+def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
+    page = web.templates.get_template("entered.html").render()
+
+    async def enter(request: Request) -> Response:
+        """Exchange a link's token for a cookie.
+
+        The browser leaves this page by itself: a redirect would still belong to the site on which
+        the link was opened, and get no cookie.
+        """
+        role = web.access.role_of(request.query_params.get("token", ""))
+        if role is None:
+            return PlainTextResponse("this link is not valid (any more)\n", 403)
+        secure = request.url.scheme == "https"
+        name, value = set_cookie(COOKIE, web.access.cookie(role), secure=secure)
+        return HTMLResponse(page, headers={name: value})
+
+    return enter
+
+
+async def _name(request: Request) -> Response:
+    """Keep the name of the person at this browser."""
+    name = (await form(request)).get("name", "").strip()
+    secure = request.url.scheme == "https"
+    header, value = set_cookie(NAME_COOKIE, name[:100], secure=secure)
+    return Response(status_code=303, headers={header: value, "location": "/"})
