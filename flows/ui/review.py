@@ -114,7 +114,11 @@ def row_of(store: Store, item: Collected, trial: str, order: int) -> ReviewRow:
 
 
 class TrialList:
-    """The rows of a store; `refresh` makes those again that may have changed."""
+    """The rows of a store; `refresh` makes those again that may have changed.
+
+    Attributes:
+        changes: a number that grows whenever a row changes.
+    """
 
     def __init__(self, store: Store, campaigns: Sequence[str] = ()) -> None:
         self.store = store
@@ -123,6 +127,7 @@ class TrialList:
         self._ranks: Mapping[tuple[str, str], int] = {}
         self.items: dict[str, Collected] = {}
         self.rows: list[ReviewRow] = []
+        self.changes = 0
         self.refresh()
 
     def refresh(self) -> bool:
@@ -164,6 +169,7 @@ class TrialList:
                 except StoreError:
                     continue  # it was damaged or taken away in the meantime: `verify` names it
         self.items, self.rows, self._folders = items, rows, folders
+        self.changes += 1
         return True
 
     def row(self, campaign: str, trial: str) -> ReviewRow:
@@ -181,13 +187,16 @@ class TrialList:
         """Make the row of a trial again."""
         item = self.items[row.campaign]
         fresh = self._ranked(row_of(self.store, item, row.trial, row.order))
-        self.rows = [fresh if other.name == row.name else other for other in self.rows]
+        if fresh != row:
+            self.rows = [fresh if other.name == row.name else other for other in self.rows]
+            self.changes += 1
         return fresh
 
     def rank(self, names: Sequence[tuple[str, str]]) -> None:
         """List trials, by campaign and id, in this order, and others behind them."""
         self._ranks = {name: place for place, name in enumerate(names)}
         self.rows = [self._ranked(row) for row in self.rows]
+        self.changes += 1
 
     @property
     def ranked(self) -> bool:

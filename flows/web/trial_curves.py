@@ -193,11 +193,12 @@ def _rings(shown: ShownTrial, index: int, seen: np.ndarray) -> str:
 
 
 def _tails(shown: ShownTrial, index: int) -> str:
-    """Return the tracks of the last frames; a marker that was lost interrupts its own."""
+    """Return the tracks of the last frames."""
     if shown.xy_px is None:
         return ""
     tracks = shown.xy_px[max(0, index - TAIL_FRAMES) : index + 1].transpose(1, 0, 2)
-    lines = (" ".join(f"{x:.1f},{y:.1f}" for x, y in track if x == x and y == y) for track in tracks)
+    seen = (track[np.isfinite(track).all(axis=1)] for track in tracks)
+    lines = (" ".join(f"{x:.1f},{y:.1f}" for x, y in track) for track in seen)
     return "".join(f"<polyline points='{line}'/>" for line in lines)
 
 

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
+from sliplab.flows.ui.review import TrialList
 from sliplab.flows.web.access import Access, Viewer
 from sliplab.storage.trials.store import Store
 
@@ -44,12 +45,16 @@ class Web:
         store: that the pages show.
         access: who may do what.
         prefect: address of Prefect's page, relative to this application or absolute; None without.
+        reviews: the trials to review, where another choice or order than that of all is wanted.
+        who: name of a viewer who has given none.
         templates: those of `templates/`.
     """
 
     store: Store
     access: Access
     prefect: str | None = None
+    reviews: TrialList | None = None
+    who: str = ""
     templates: Environment = field(default_factory=_environment)
 
     def render(

@@ -7,6 +7,8 @@ export const seconds = (ns) => Number(ns) / 1e9;
 // a line moved by hand is set to a tenth of a millisecond
 const nanoseconds = (time) => String(BigInt(Math.round(time * 1e4)) * 100000n);
 
+const left = (event, svg) => event.clientX - svg.getBoundingClientRect().left;
+
 function add(parent, name, attributes = {}, text = "") {
   const made = document.createElementNS("http://www.w3.org/2000/svg", name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -40,7 +42,7 @@ export class Panels {
 
   panel(panel, place) {
     const figure = document.createElement("figure"), caption = figure.appendChild(document.createElement("figcaption"));
-    figure.className = "panel";
+    figure.className = "plot";
     caption.append(panel.unit ? `${panel.name} (${panel.unit})` : panel.name);
     const named = new Map(panel.curves.filter((curve) => curve.name).map((curve) => [curve.name, curve.kind]));
     for (const [name, kind] of [...named].reverse()) {
@@ -178,7 +180,7 @@ export class Panels {
   near(event, svg) {
     if (!this.change) return null;
     const { x } = this.scale(svg), reach = event.pointerType === "touch" ? 2 * GRAB_PX : GRAB_PX;
-    const far = (kind) => Math.abs(x(seconds(this.lines[`${kind}_ns`])) - event.offsetX);
+    const far = (kind) => Math.abs(x(seconds(this.lines[`${kind}_ns`])) - left(event, svg));
     return KINDS.filter((kind) => this.lines[`${kind}_ns`] !== null && far(kind) < reach).sort((a, b) => far(a) - far(b))[0] ?? null;
   }
 
@@ -190,7 +192,7 @@ export class Panels {
   }
 
   moved(event, svg) {
-    const time = this.scale(svg).time(event.clientX - svg.getBoundingClientRect().left);
+    const time = this.scale(svg).time(left(event, svg));
     svg.style.cursor = this.held || this.near(event, svg) ? "ew-resize" : "";
     if (this.held) this.put(this.held, time);
     else this.cursor(Math.min(Math.max(time, this.trial.span[0]), this.trial.span[1]));
@@ -200,7 +202,7 @@ export class Panels {
   wheeled(event, svg) {
     if (!event.ctrlKey && !event.shiftKey) return;
     event.preventDefault();
-    const at = this.scale(svg).time(event.offsetX), factor = event.deltaY + event.deltaX > 0 ? 1.25 : 0.8;
+    const at = this.scale(svg).time(left(event, svg)), factor = event.deltaY + event.deltaX > 0 ? 1.25 : 0.8;
     const bound = (time) => Math.min(Math.max(time, this.trial.span[0]), this.trial.span[1]);
     const [start, end] = this.range.map((time) => bound(at + (time - at) * factor));
     if (end - start > 1e-3) this.range = [start, end];
