@@ -13,14 +13,14 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from sliplab.flows.web import log
+from sliplab.flows.web import log, report, review, trials
 from sliplab.flows.web.access import COOKIE, NAME_COOKIE, Gate, set_cookie
 from sliplab.flows.web.web import form
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
 
-SUBJECTS = (log.routes,)
+SUBJECTS = (trials.routes, review.routes, report.routes, log.routes)
 
 
 def application(web: Web) -> Starlette:

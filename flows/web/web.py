@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from sliplab.flows.server.service import Service
+from sliplab.flows.ui.review import TrialList
 from sliplab.flows.web.access import Access, Viewer
 from sliplab.storage.trials.store import Store
 
@@ -47,6 +48,8 @@ class Web:
         prefect: address of Prefect's page, relative to this application or absolute; None without.
         schedules: the file of schedules that is served; None without.
         service: that runs this page; None for the page of a store without one.
+        reviews: the trials to review, where another choice or order than that of all is wanted.
+        who: name of a viewer who has given none.
         templates: those of `templates/`.
     """
 
@@ -55,6 +58,8 @@ class Web:
     prefect: str | None = None
     schedules: Path | None = None
     service: Service | None = None
+    reviews: TrialList | None = None
+    who: str = ""
     templates: Environment = field(default_factory=_environment)
 
     def render(
