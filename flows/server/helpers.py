@@ -10,19 +10,16 @@ from contextlib import suppress
 from sliplab.flows.running import console
 from sliplab.storage.process import Child, start_tethered
 
-AGAIN_S = 60.0
-"""Wait before one is started again, s."""
 END_S = 5.0
 """Longest wait for its end, s."""
 
 
-async def keep_running(
-    command: Sequence[str], stopped: asyncio.Event, *, again_s: float = AGAIN_S
-) -> None:
+async def keep_running(command: Sequence[str], stopped: asyncio.Event, *, again_s: float) -> None:
     """Run `sliplab COMMAND` until `stopped`; start it again when it has ended by itself.
 
     Args:
         command: its words after ``sliplab``.
+        again_s: wait before it is started again, s.
     """
     while not stopped.is_set():
         try:

@@ -30,6 +30,8 @@ from sliplab.storage.trials.store import Store
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
+AGAIN_S = {"page": 5.0, "alerts": 60.0}
+"""Wait before a program beside the service is started again, s."""
 POLL_S = 1.0
 """Longest interval between polls for runs, s: a request to the arm must not wait."""
 
@@ -134,7 +136,10 @@ async def _serve(
     with temporary_settings(updates=limits):
         carrying_out = asyncio.create_task(served.carry_out(min(poll_s, POLL_S), stopped))
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
-    helping = [asyncio.create_task(keep_running(words, stopped)) for words in programs]
+    helping = [
+        asyncio.create_task(keep_running(words, stopped, again_s=AGAIN_S[words[0]]))
+        for words in programs
+    ]
     ending = asyncio.create_task(stopped.wait())
     shown = ", ".join(deployment_name(flow.name, here.name) for flow in (ON_RIG[0], *CONTROL))
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments {shown} and others")

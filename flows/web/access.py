@@ -195,7 +195,7 @@ def _with_policy(send: Send) -> Send:
                 headers.append((b"cache-control", b"no-store"))
             headers += [
                 (b"x-content-type-options", b"nosniff"),
-                (b"referrer-policy", b"no-referrer"),
+                (b"referrer-policy", b"same-origin"),
             ]
             message["headers"] = headers
         await send(message)

@@ -14,7 +14,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from sliplab.flows.collecting import requests
-from sliplab.flows.server.service import deployment_name
+from sliplab.flows.server.service import Service, deployment_name
 from sliplab.flows.web.web import form, named, viewer
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
@@ -140,16 +140,30 @@ class Controls:
             if not trials.isascii() or not trials.isdigit():
                 raise InputError("count", "", trials, "must be a number of trials")
             wanted["trials"] = int(trials)
-        from prefect.client.orchestration import get_client
-        from prefect.states import Scheduled
+        # Prefect takes seconds to load, during which the pages of others must not stand still
+        await self._run(self._others, partial(_create_run, here, wanted))
 
-        name = f"collect/{deployment_name('collect', here.name)}"
-        try:
-            async with asyncio.timeout(ANSWER_S), get_client() as client:
-                deployment = await client.read_deployment_by_name(name)
-                await client.create_flow_run_from_deployment(
-                    deployment.id, parameters={"wanted": wanted}, state=Scheduled()
-                )
-        except Exception as error:
-            text = str(error) or type(error).__name__
-            raise StoreError(f"Prefect's server did not take the run: {text}") from error
+
+def _create_run(here: Service, wanted: Mapping[str, Any]) -> None:
+    """Ask Prefect's server for a run of the service's deployment.
+
+    Raises:
+        StoreError: it did not take it.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.settings import PREFECT_CLIENT_MAX_RETRIES, temporary_settings
+    from prefect.states import Scheduled
+
+    name = f"collect/{deployment_name('collect', here.name)}"
+    try:
+        with (
+            temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: 0}),
+            get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
+        ):
+            deployment = client.read_deployment_by_name(name)
+            client.create_flow_run_from_deployment(
+                deployment.id, parameters={"wanted": wanted}, state=Scheduled()
+            )
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        raise StoreError(f"Prefect's server did not take the run: {text}") from error
