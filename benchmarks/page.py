@@ -3,8 +3,8 @@
 A simulated rig takes trials with and without viewers in turn. `watched_over_alone` is the processor
 time that the collecting program spends on a planned second with viewers over that without (its wall
 time says more about what else the machine does), `page_core_percent` the processor time of the
-page's program while it is watched, as a share of one core, `page_memory_mb` what it holds at the end, and
-`pictures_per_s` how often each viewer gets new pictures.
+page's program while it is watched, as a share of one core, `page_memory_mb` what it holds at the
+end, and `pictures_per_s` how often each viewer gets new pictures.
 """
 
 from __future__ import annotations

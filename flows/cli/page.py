@@ -69,7 +69,7 @@ def page(
             for link in found.values():
                 console.show(link)
         serving.serve(web, listener, public)
-    stopping.check()
+        stopping.check()
 
 
 def origin(url: str) -> str:
