@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
+from sliplab.flows.server.service import Service
 from sliplab.flows.ui.review import TrialList
 from sliplab.flows.web.access import Access, Viewer
 from sliplab.storage.trials.store import Store
@@ -45,6 +46,8 @@ class Web:
         store: that the pages show.
         access: who may do what.
         prefect: address of Prefect's page, relative to this application or absolute; None without.
+        schedules: the file of schedules that is served; None without.
+        service: that runs this page; None for the page of a store without one.
         reviews: the trials to review, where another choice or order than that of all is wanted.
         who: name of a viewer who has given none.
         templates: those of `templates/`.
@@ -53,6 +56,8 @@ class Web:
     store: Store
     access: Access
     prefect: str | None = None
+    schedules: Path | None = None
+    service: Service | None = None
     reviews: TrialList | None = None
     who: str = ""
     templates: Environment = field(default_factory=_environment)
