@@ -14,8 +14,8 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from sliplab.flows.web import log, report, review, trials
-from sliplab.flows.web.access import COOKIE, NAME_COOKIE, Gate, set_cookie
-from sliplab.flows.web.web import form
+from sliplab.flows.web.access import NAME_COOKIE, Gate, cookie_name, set_cookie
+from sliplab.flows.web.web import PAGES, form
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
@@ -37,10 +37,11 @@ def application(web: Web) -> Starlette:
 
 
 def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
-    page = web.templates.get_template("entered.html").render()
+    page = web.templates.get_template("entered.html")
+    places = {path for path, _ in PAGES}
 
     async def enter(request: Request) -> Response:
-        """Exchange a link's token for a cookie.
+        """Exchange a link's token for a cookie, and go to the page ``to``.
 
         The browser leaves this page by itself: a redirect would still belong to the site on which
         the link was opened, and get no cookie.
@@ -49,8 +50,10 @@ def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
         if role is None:
             return PlainTextResponse("this link is not valid (any more)\n", 403)
         secure = request.url.scheme == "https"
-        name, value = set_cookie(COOKIE, web.access.cookie(role), secure=secure)
-        return HTMLResponse(page, headers={name: value})
+        own = cookie_name(request.headers.get("host", ""))
+        name, value = set_cookie(own, web.access.cookie(role), secure=secure)
+        to = request.query_params.get("to", "/")
+        return HTMLResponse(page.render(to=to if to in places else "/"), headers={name: value})
 
     return enter
 
