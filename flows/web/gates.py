@@ -40,7 +40,9 @@ class GateText:
 
 def gate_texts(gates: dict[str, Gate]) -> list[GateText]:
     """Return all gates in words, failed ones first."""
-    found = (GateText(_name(name), _figure(name, gate), gate.passed) for name, gate in gates.items())
+    found = (
+        GateText(_name(name), _figure(name, gate), gate.passed) for name, gate in gates.items()
+    )
     return sorted(found, key=lambda text: text.passed)
 
 

@@ -83,9 +83,7 @@ def _panels(shown: ShownTrial) -> list[Json]:
     return found
 
 
-def _panel(
-    name: str, unit: str, time_s: F64, values: F64, curves: list[tuple[str, str]]
-) -> Json:
+def _panel(name: str, unit: str, time_s: F64, values: F64, curves: list[tuple[str, str]]) -> Json:
     """Return curves over one axis.
 
     Args:
