@@ -1,7 +1,7 @@
 """`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from another process.
 
 Those before `serve` are for another terminal: each request is stored in STORE/control/ with its
-user, time and reason. `serve` offers one rig's deployments on its page and Prefect's, with schedules.
+user, time and reason. `serve` offers one rig's deployments, with schedules, on a page.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from sliplab.flows.server.helpers import keep_running
 from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
 from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
-from sliplab.flows.server.service import Service
+from sliplab.flows.server.service import Service, deployment_name
 from sliplab.flows.web.access import ROLES
 from sliplab.flows.web.links import Links
 from sliplab.protocols import InputError
@@ -184,11 +184,6 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
         )
         for item in schedules
     ]
-
-
-def deployment_name(flow: str, name: str) -> str:
-    """Return the name of a flow's deployment, which begins with what it does: ``stop NAME``."""
-    return f"{flow} {name}"
 
 
 async def _refuse_another(flow: str, name: str, store: Path) -> None:

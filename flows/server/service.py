@@ -86,3 +86,8 @@ def service() -> Service:
         raise RuntimeError("this flow runs only under `sliplab serve`")
     given = json.loads(text)
     return Service(**{**given, "protocols": tuple(given["protocols"])})
+
+
+def deployment_name(flow: str, name: str) -> str:
+    """Return the name of a flow's deployment, which begins with what it does: ``stop NAME``."""
+    return f"{flow} {name}"

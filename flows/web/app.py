@@ -13,21 +13,20 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from sliplab.flows.web import log, report, review, trials
-from sliplab.flows.web.access import NAME_COOKIE, Gate, cookie_name, set_cookie
-from sliplab.flows.web.web import PAGES, form
+from sliplab.flows.web import live, log, report, review, schedules, trials
+from sliplab.flows.web.access import Gate, cookie_name, set_cookie
+from sliplab.flows.web.web import PAGES, is_secure
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
 
-SUBJECTS = (trials.routes, review.routes, report.routes, log.routes)
+SUBJECTS = (live.routes, trials.routes, review.routes, report.routes, log.routes, schedules.routes)
 
 
 def application(web: Web) -> Starlette:
     """Return the application of one store. `SameOrigin` must be in front of it."""
     routes: list[BaseRoute] = [
         Route("/enter", _enter(web)),
-        Route("/name", _name, methods=["POST"]),
         Mount("/static", StaticFiles(directory=Path(__file__).with_name("static"))),
     ]
     for subject in SUBJECTS:
@@ -49,18 +48,9 @@ def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
         role = web.access.role_of(request.query_params.get("token", ""))
         if role is None:
             return PlainTextResponse("this link is not valid (any more)\n", 403)
-        secure = request.url.scheme == "https"
         own = cookie_name(request.headers.get("host", ""))
-        name, value = set_cookie(own, web.access.cookie(role), secure=secure)
+        name, value = set_cookie(own, web.access.cookie(role), secure=is_secure(request))
         to = request.query_params.get("to", "/")
         return HTMLResponse(page.render(to=to if to in places else "/"), headers={name: value})
 
     return enter
-
-
-async def _name(request: Request) -> Response:
-    """Keep the name of the person at this browser."""
-    name = (await form(request)).get("name", "").strip()
-    secure = request.url.scheme == "https"
-    header, value = set_cookie(NAME_COOKIE, name[:100], secure=secure)
-    return Response(status_code=303, headers={header: value, "location": "/"})

@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from sliplab.flows.log import add_note, log_entries
-from sliplab.flows.web.web import form, viewer
+from sliplab.flows.web.web import form, named, viewer
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
@@ -32,13 +32,15 @@ def routes(web: Web) -> list[BaseRoute]:
         )
 
     async def note(request: Request) -> Response:
-        text = (await form(request)).get("text", "")
+        given = await form(request)
+        text, name = given.get("text", ""), viewer(request).name
+        who = given.get("who", "").strip()[:100] or name
         try:
-            await asyncio.to_thread(add_note, web.store, text, who=viewer(request).name)
+            await asyncio.to_thread(add_note, web.store, text, who=who)
         except ValueError as error:
             return web.render(
                 request, "problem.html", 422, title="Log", problem=f"The note {error}."
             )
-        return RedirectResponse("/log", 303)
+        return named(request, RedirectResponse("/log", 303), who)
 
     return [Route("/log", show), Route("/log", note, methods=["POST"])]

@@ -10,11 +10,11 @@ from urllib.parse import parse_qsl
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from starlette.requests import Request
-from starlette.responses import HTMLResponse
+from starlette.responses import HTMLResponse, Response
 
 from sliplab.flows.server.service import Service
 from sliplab.flows.ui.review import TrialList
-from sliplab.flows.web.access import Access, Viewer
+from sliplab.flows.web.access import NAME_COOKIE, Access, Viewer, set_cookie
 from sliplab.storage.trials.store import Store
 
 PAGES = (
@@ -77,13 +77,30 @@ class Web:
             "store": self.store.folder,
             "prefect": self.prefect,
         }
-        return self.templates.get_template(template).render({**shared, **values})
+        return self.part(template, **shared, **values)
+
+    def part(self, template: str, **values: Any) -> str:
+        """Return the text of a part that is the same for all viewers."""
+        return self.templates.get_template(template).render(values)
 
 
 def viewer(request: Request) -> Viewer:
     """Return who asks; the gate has checked it."""
     found: Viewer = request.state.viewer
     return found
+
+
+def is_secure(request: Request) -> bool:
+    """Return whether the browser came through TLS, so that its cookies may be for that alone."""
+    return request.headers.get("x-forwarded-proto", request.url.scheme) == "https"
+
+
+def named(request: Request, answer: Response, who: str) -> Response:
+    """Let a browser keep the name that its person has just given."""
+    if who and who != viewer(request).name:
+        header, value = set_cookie(NAME_COOKIE, who, secure=is_secure(request))
+        answer.headers.append(header, value)
+    return answer
 
 
 async def form(request: Request) -> Mapping[str, str]:
