@@ -21,7 +21,7 @@ from sliplab.storage.trials.store import Store
 
 RATE_NS = 10_000_000
 """Width of a bin of the event rate."""
-SPEED_S = 0.05
+SPEED_S = 0.2
 """Interval over which the tool's speed is measured."""
 
 

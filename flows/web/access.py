@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Role = Literal["operator", "reader"]
 ROLES: tuple[Role, ...] = ("operator", "reader")
 COOKIE, NAME_COOKIE = "sliplab", "sliplab-name"
+"""The first is followed by the server's port: browsers send cookies to all ports of a host."""
 CSRF_FIELD, CSRF_HEADER = "csrf", "x-csrf-token"
 DAYS = 60
 """Life of a cookie."""
@@ -65,6 +66,11 @@ class Access:
 
     tokens: Mapping[Role, str]
 
+    @staticmethod
+    def temporary() -> Access:
+        """Return new tokens, for a page that nobody opens once its program has ended."""
+        return Access({role: secrets.token_urlsafe(32) for role in ROLES})
+
     def role_of(self, token: str) -> Role | None:
         """Return whose link has this token; None for no one's."""
         for role in ROLES:
@@ -77,9 +83,9 @@ class Access:
         nonce = secrets.token_urlsafe(16)
         return f"{role}.{nonce}.{self._signed(role, f'cookie {nonce}')}"
 
-    def viewer(self, cookies: Mapping[str, str]) -> Viewer | None:
-        """Return who has these cookies; None without a valid one."""
-        role, _, rest = cookies.get(COOKIE, "").partition(".")
+    def viewer(self, cookies: Mapping[str, str], host: str = "") -> Viewer | None:
+        """Return who has these cookies of a host; None without a valid one."""
+        role, _, rest = cookies.get(cookie_name(host), "").partition(".")
         nonce, _, signature = rest.partition(".")
         for known in ROLES:
             right = self._signed(known, f"cookie {nonce}")
@@ -90,6 +96,12 @@ class Access:
 
     def _signed(self, role: Role, text: str) -> str:
         return hmac.new(self.tokens[role].encode(), text.encode(), hashlib.sha256).hexdigest()
+
+
+def cookie_name(host: str) -> str:
+    """Return the name of the cookie of a server, given the value of `Host`."""
+    port = host.rpartition(":")[2]
+    return f"{COOKIE}-{port}" if port.isdecimal() else COOKIE
 
 
 def set_cookie(name: str, value: str, *, secure: bool) -> tuple[str, str]:
@@ -124,7 +136,8 @@ class Gate:
         if scope["path"].startswith(OPEN):
             await self._app(scope, receive, send)
             return
-        viewer = self._access.viewer(_cookies(headers.get("cookie", "")))
+        cookies = _cookies(headers.get("cookie", ""))
+        viewer = self._access.viewer(cookies, headers.get("host", ""))
         if viewer is None:
             answer = PlainTextResponse(self._entry, 401, media_type="text/html")
             await answer(scope, receive, send)

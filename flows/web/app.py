@@ -14,8 +14,8 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from sliplab.flows.web import live, log, report, review, schedules, trials
-from sliplab.flows.web.access import COOKIE, Gate, set_cookie
-from sliplab.flows.web.web import is_secure
+from sliplab.flows.web.access import Gate, cookie_name, set_cookie
+from sliplab.flows.web.web import PAGES, is_secure
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
@@ -36,10 +36,11 @@ def application(web: Web) -> Starlette:
 
 
 def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
-    page = web.templates.get_template("entered.html").render()
+    page = web.templates.get_template("entered.html")
+    places = {path for path, _ in PAGES}
 
     async def enter(request: Request) -> Response:
-        """Exchange a link's token for a cookie.
+        """Exchange a link's token for a cookie, and go to the page ``to``.
 
         The browser leaves this page by itself: a redirect would still belong to the site on which
         the link was opened, and get no cookie.
@@ -47,8 +48,9 @@ def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:
         role = web.access.role_of(request.query_params.get("token", ""))
         if role is None:
             return PlainTextResponse("this link is not valid (any more)\n", 403)
-        secure = is_secure(request)
-        name, value = set_cookie(COOKIE, web.access.cookie(role), secure=secure)
-        return HTMLResponse(page, headers={name: value})
+        own = cookie_name(request.headers.get("host", ""))
+        name, value = set_cookie(own, web.access.cookie(role), secure=is_secure(request))
+        to = request.query_params.get("to", "/")
+        return HTMLResponse(page.render(to=to if to in places else "/"), headers={name: value})
 
     return enter

@@ -73,7 +73,8 @@ def amount(name: str, value: float) -> str:
     if unit == "s":
         if value == 0:
             return "0 s"
-        factor, unit = next((pair for pair in _SECONDS if abs(value) >= pair[0]), _SECONDS[-1])
+        rounded = float(f"{abs(value):.3g}")
+        factor, unit = next((pair for pair in _SECONDS if rounded >= pair[0]), _SECONDS[-1])
         return f"{value / factor:.3g} {unit}"
     number = f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"
     return f"{number} {_UNITS[unit]}" if unit in _UNITS else number

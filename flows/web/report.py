@@ -16,7 +16,6 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from sliplab.analysis.report.sources import report_folder
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside
 from sliplab.storage.trials.store import Store
@@ -25,11 +24,12 @@ if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
 
 MAIN = "index.html"
+FOLDER = "report"
 _STEPS = (
     ("label", "derived/labels"),
     ("train", "models"),
     ("evaluate", "derived/evaluation"),
-    ("report", f"report/{MAIN}"),
+    ("report", f"{FOLDER}/{MAIN}"),
 )
 """Commands that lead to the report, and where each leaves its results."""
 _TYPES = {
@@ -79,9 +79,9 @@ def routes(web: Web) -> list[BaseRoute]:
         )
 
     async def file(request: Request) -> Response:
-        path = report_folder(web.store) / request.path_params["path"]
+        path = web.store.folder / FOLDER / request.path_params["path"]
         try:
-            known = inside(path, report_folder(web.store)).is_file()
+            known = inside(path, web.store.folder / FOLDER).is_file()
         except (StoreError, OSError, ValueError):
             known = False
         if not known or path.suffix not in _TYPES:
@@ -94,7 +94,7 @@ def routes(web: Web) -> list[BaseRoute]:
 
 def _made(store: Store) -> tuple[list[Made], list[Made]]:
     """Return the pages, that of the whole store first, and the steps up to it."""
-    folder = report_folder(store)
+    folder = store.folder / FOLDER
     paths = sorted(folder.rglob("*.html"), key=lambda path: (path != folder / MAIN, path))
     pages = [Made(str(path.relative_to(folder)), _title(path), _when(path)) for path in paths]
     steps = [Made(name, "", _when(store.folder / place)) for name, place in _STEPS]

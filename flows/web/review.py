@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel, StrictInt, ValidationError
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
@@ -92,6 +92,26 @@ def routes(web: Web) -> list[BaseRoute]:
     ]
 
 
+class _Lines(BaseModel):
+    """Where the onset lines are, ns; texts, as scripts round greater numbers."""
+
+    incipient_ns: int | None
+    gross_ns: int | None
+
+
+class _Asked(BaseModel):
+    """A decision as the page sends it; see `record_verdict`."""
+
+    campaign: str
+    trial: str
+    verdict: Verdict
+    lines: _Lines
+    label: str
+    seen: StrictInt
+    who: str
+    why: str
+
+
 class Reviews:
     """The trials to review, read when they are first asked for, and what people decide on them."""
 
@@ -165,27 +185,22 @@ class Reviews:
     def decide(self, body: bytes) -> Response:
         """Store the decision that a request's body describes, and answer with what was stored."""
         try:
-            asked = json.loads(body)
-            lines = {kind: None if ns is None else int(ns) for kind, ns in asked["lines"].items()}
-            if not str(asked["who"]).strip():
+            asked = _Asked.model_validate_json(body)
+            if not asked.who.strip():
                 raise ValueError("a decision needs the name of its reviewer")
             trials = self.trials()
             with self._lock:
-                row = trials.row(asked["campaign"], asked["trial"])
-                made = record_verdict(
-                    trials,
-                    row,
-                    asked["verdict"],
-                    ReviewedOnsets(**lines),
-                    label=asked["label"],
-                    seen=asked["seen"],
-                    who=asked["who"],
-                    why=asked["why"],
-                )
+                row = trials.row(asked.campaign, asked.trial)
+                lines = ReviewedOnsets(**vars(asked.lines))
+                shared = asked.model_dump(include={"label", "seen", "who", "why"})
+                made = record_verdict(trials, row, asked.verdict, lines, **shared)
                 trials.renew(row)
+        except ValidationError as error:
+            first = error.errors()[0]
+            return _refused(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", 422)
         except (LabelChanged, review.Overtaken) as error:
             return _refused(f"{error}. Review it and decide again", 409)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except ValueError as error:
             return _refused(str(error), 422)
         except (OSError, StoreError) as error:
             return _refused(str(error), 503)

@@ -18,6 +18,8 @@ MOST_POINTS = 4000
 """Points of a curve; a longer one is drawn by the least and the greatest value of each part."""
 TAIL_FRAMES = 60
 """Number of earlier frames through which a track is drawn."""
+_ONLY = [("", "only")]
+"""Name and kind of the only curve of a panel."""
 _RING = 0.2
 """Radius of a ring around a marker, as a share of the skin's spacing."""
 
@@ -63,7 +65,7 @@ def _panels(shown: ShownTrial) -> list[Json]:
         moved = shown.displacement_px[:, order]
         found.append(_panel("displacement", "px", shown.frame_s, moved, curves))
     if len(shown.rate):
-        found.append(_panel("events", "1/s", shown.rate_s, shown.rate[:, None], [("", "")]))
+        found.append(_panel("events", "1/s", shown.rate_s, shown.rate[:, None], _ONLY))
     for name, about in sorted(recording.record.streams.items()):
         if about.kind == WRENCH.name and has_forces(recording, name):
             forces = plate_forces(recording, name)
@@ -72,12 +74,12 @@ def _panels(shown: ShownTrial) -> list[Json]:
             found.append(_panel(name, "N", forces.t_ns / 1e9, values, parts))
     time_s, speed = tool_speed(recording)
     if len(speed):
-        found.append(_panel("speed of the tool", "mm/s", time_s, speed[:, None], [("", "")]))
+        found.append(_panel("speed of the tool", "mm/s", time_s, speed[:, None], _ONLY))
     for name, about in sorted(recording.record.streams.items()):
         if about.kind == SCALAR.name and about.rows and name in recording.clocks.devices():
             read = recording.scalars(name)
             time_s = np.asarray(recording.clock(name).to_reference(read.t_ns)) / 1e9
-            found.append(_panel(name, read.unit, time_s, read.value[:, None], [("", "")]))
+            found.append(_panel(name, read.unit, time_s, read.value[:, None], _ONLY))
     return found
 
 

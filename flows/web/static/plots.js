@@ -84,6 +84,7 @@ export class Panels {
     high = high > low ? high + 0.05 * (high - low) : low + 1;
     const y = (value) => height - BOTTOM - (value - low) / (high - low) * (height - TOP - BOTTOM);
     svg.replaceChildren();
+    [svg.dataset.start, svg.dataset.end] = this.range;
     const id = `area-${place}`, area = { x: LEFT, y: TOP, width: Math.max(0, width - LEFT - RIGHT), height: height - TOP - BOTTOM };
     add(add(svg, "clipPath", { id }), "rect", area);
     add(svg, "rect", { ...area, class: "area" });
