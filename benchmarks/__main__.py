@@ -25,6 +25,7 @@ NAMES = (
     "network",
     "live",
     "orchestration",
+    "page",
     "acquisition",
     "scale",
     "exchange_memory",

@@ -17,6 +17,7 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import SEED, peak_mb
+from sliplab.flows.collecting.live_feed import LiveFeed
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import Trial
@@ -60,9 +61,11 @@ def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[
         device.connect()
         every = list(run_request.plan)
         chosen = np.random.default_rng(SEED).choice(len(every), count, replace=False)
-        collector = TrialCollector(run_request.plan, run_request.rig, device, campaign)
+        feed = LiveFeed(run_request)
+        collector = TrialCollector(run_request.plan, run_request.rig, device, campaign, feed=feed)
         try:
-            yield SimulatedSession(collector, [every[index] for index in sorted(chosen)])
+            with feed.running():
+                yield SimulatedSession(collector, [every[index] for index in sorted(chosen)])
         finally:
             device.close()
 

@@ -37,7 +37,7 @@ LOOK_BACK = 50
 CONFIDENCE = 0.9
 """Of the interval of the nights that are left."""
 FEWEST = 4
-"""Nights from which an interval is given."""
+"""Nights, and trials, from which an interval is given."""
 _MOST_TIMES = 20
 """Times the expected nights up to which an upper bound is looked for."""
 LONGEST_GAP = 3.0
@@ -93,6 +93,7 @@ class CampaignStatus:
         last_ended: when the last committed trial ended, UTC.
         nights: nights on which trials were committed; tonight: trials of the current one.
         seconds_left: at the rig, by the planned times and the pace so far; None without a trial.
+        seconds_left_error: half of its 90 % interval; None with few trials.
         nights_left: None while nothing is known, or nothing is missing.
         bytes_per_trial: median on disk; None without a trial.
         nights_of_disk: nights until the disk is full, at the pace so far.
@@ -113,6 +114,7 @@ class CampaignStatus:
     nights: int = 0
     tonight: int = 0
     seconds_left: float | None = None
+    seconds_left_error: float | None = None
     nights_left: NightsLeft | None = None
     bytes_per_trial: int | None = None
     nights_of_disk: float | None = None
@@ -216,7 +218,9 @@ class StatusReader:
             over = nights[:-1] if tonight else nights
             sizes = [folders[trial.id].bytes for trial in done[-LOOK_BACK:]]
             size = round(median(sizes)) if sizes else None
-            pace = pace_of(plan, ended)
+            paces = paces_of(plan, ended)
+            pace = median(paces) if paces else None
+            error = pace_error(paces, len(missing))
             left = sum(plan.seconds(trial) for trial in missing)
             a_night = mean(over or nights) if nights else 0.0
             logged = self._logged.setdefault(
@@ -237,6 +241,7 @@ class StatusReader:
                 nights=len(nights),
                 tonight=tonight,
                 seconds_left=left * pace if missing and pace is not None else None,
+                seconds_left_error=None if error is None or not missing else left * error,
                 nights_left=_nights_left(by_night, over, len(missing), now),
                 bytes_per_trial=size,
                 nights_of_disk=free / (size * a_night) if size and a_night else None,
@@ -290,14 +295,14 @@ def night_of(moment: datetime) -> date:
     return (moment - timedelta(hours=12)).date()
 
 
-def pace_of(plan: Plan, ended: dict[str, datetime]) -> float | None:
-    """Return the seconds that a planned second takes, median of the last trials.
+def paces_of(plan: Plan, ended: dict[str, datetime]) -> list[float]:
+    """Return the seconds that a planned second took, of each of the last trials.
 
     Args:
         ended: when trials ended, by id.
 
     Returns:
-        None with fewer than two trials in a row.
+        Nothing with fewer than two trials in a row.
     """
     planned = {trial.id: plan.seconds(trial) for trial in plan if trial.id in ended}
     order = sorted(ended, key=lambda trial: (ended[trial], trial))
@@ -306,7 +311,20 @@ def pace_of(plan: Plan, ended: dict[str, datetime]) -> float | None:
         took = (ended[trial] - ended[before]).total_seconds()
         if planned[trial] > 0 and 0 <= took <= LONGEST_GAP * planned[trial] + 60:
             paces.append(took / planned[trial])
-    return median(paces[-LOOK_BACK:]) if paces else None
+    return paces[-LOOK_BACK:]
+
+
+def pace_error(paces: Sequence[float], missing: int) -> float | None:
+    """Return half of the 90 % interval of the mean pace of the missing trials; None with few.
+
+    The variance of the mean of n further trials, seen from k, is s^2 (1 / n + 1 / k).
+    """
+    if len(paces) < FEWEST or not missing:
+        return None
+    from scipy.special import stdtrit
+
+    t = float(stdtrit(len(paces) - 1, (1 + CONFIDENCE) / 2))
+    return t * stdev(paces) * math.sqrt(1 / missing + 1 / len(paces))
 
 
 def nights_needed(trials: Sequence[int], missing: int) -> tuple[int, int | None, int | None]:

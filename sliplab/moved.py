@@ -14,7 +14,6 @@ MOVED = {
     "sliplab.analysis.bench": "sliplab.plugins.bench",
     "sliplab.protocols.conditions": "sliplab.protocols.model",
     "sliplab.flows.planning.schema": "sliplab.flows.planning.json_schemas",
-    "sliplab.flows.ui.review_page": "sliplab.flows.ui.review_tab",
     "sliplab.rigs.mock.faults": "sliplab.rigs.mock.fault_book",
     "sliplab.rigs.mock.fault_settings": "sliplab.rigs.mock.fault_kinds",
     "sliplab.rigs.devices.settings": "sliplab.rigs.device_section",

@@ -1,7 +1,7 @@
 """`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from another process.
 
 Those before `serve` are for another terminal: each request is stored in STORE/control/ with its
-user, time and reason. `serve` offers one rig's deployments on Prefect's page, with schedules.
+user, time and reason. `serve` offers one rig's deployments, with schedules, on a page.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import typer
 
 from sliplab.flows.cli.common import COLLECT, JsonOption, RigOption, StoreArgument, StoreOption
 from sliplab.flows.cli.model_options import model_options
+from sliplab.flows.cli.page import PublicOption, origin
 from sliplab.flows.planning.parameters import ControlOptions, Requester
 from sliplab.flows.running import console, exit_codes
 from sliplab.flows.steps import prepare_store
@@ -199,9 +200,7 @@ def serve(
     ] = None,
     port: Annotated[
         int,
-        typer.Option(
-            "--port", min=0, max=65535, help="Port of the embedded server's page; 0: any free port."
-        ),
+        typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any free port."),
     ] = 4200,
     poll: Annotated[
         float, typer.Option("--poll", min=0.2, max=60, help="Polling period for new runs, s.")
@@ -210,6 +209,7 @@ def serve(
         bool,
         typer.Option("--check", help="Validate the schedules, print the upcoming runs, and exit."),
     ] = False,
+    public_url: PublicOption = "",
     as_json: JsonOption = False,
 ) -> None:
     """Serve the flows of one rig as Prefect deployments. Ctrl-C stops the arm, then all runs."""
@@ -264,6 +264,8 @@ def serve(
         port=port,
         poll_s=poll,
         alerts=alerts,
+        shown=schedules and schedules.resolve(),
+        public=origin(public_url),
     )
     if as_json:
         console.print_json({"served": str(store), "name": name or file.name})

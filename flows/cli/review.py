@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -50,13 +51,17 @@ def review(
 
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
+    from sliplab.flows.ui.review import TrialList
+    from sliplab.storage.process import user_name
     from sliplab.storage.remote.mirror import open_store
 
     for name, given in (("--count", count is not None), ("--no-page", not page)):
         if given and not by_change:
             raise InputError(name, "", "", "goes with --next")
+    opened = open_store(store)
+    trials = TrialList(opened, campaign or ())
 
-    def begin(address: str | None, trials: TrialList) -> None:
+    def begin(address: str | None) -> None:
         waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
         found = _ordered(trials) if by_change else None
         summary = {"trials": len(trials.rows), "to_decide": waiting}
@@ -73,14 +78,22 @@ def review(
             )
             console.show(address)
 
-    if page:
-        from sliplab.flows.ui.review_server import serve
+    if not page:
+        begin(None)
+        return
+    from sliplab.flows.running import stopping
+    from sliplab.flows.web import serving
+    from sliplab.flows.web.access import Access
+    from sliplab.flows.web.web import Web
 
-        serve(open_store(store), campaign or (), port, who, begin)
-    else:
-        from sliplab.flows.ui.review import TrialList
-
-        begin(None, TrialList(open_store(store), campaign or ()))
+    access = Access.temporary()
+    web = Web(opened, access, reviews=trials, who=who or user_name())
+    with closing(serving.listen(port)) as listener:
+        port = listener.getsockname()[1]
+        token = access.tokens["operator"]
+        begin(f"http://{serving.HOST}:{port}/enter?token={token}&to=/review")
+        serving.serve(web, listener)
+    stopping.check()
 
 
 def _ordered(trials: TrialList) -> ReviewOrder:

@@ -20,6 +20,7 @@ from functools import cache
 from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
+from sliplab.flows.collecting.live_feed import LiveFeed
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -28,10 +29,10 @@ from sliplab.flows.running import stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plugin import plugins
-from sliplab.protocols.program import ACTING
+from sliplab.protocols.program import ACTING, Step
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun
+from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun, ignore_step
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
@@ -46,7 +47,7 @@ from sliplab.storage.schema.trial import (
     TrialQuality,
     TrialRecord,
 )
-from sliplab.storage.streams import Json
+from sliplab.storage.streams import Json, Sink
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
@@ -110,8 +111,10 @@ def open_session(
         campaign = _recover(store, run_request)
         supervisor = CollectionSupervisor(run_request, store, campaign, listener=listener)
         supervisor.begin()
+        feed = LiveFeed(run_request)
         # the rig is closed before results are computed
         with (
+            feed.running(),
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
         ):
@@ -128,6 +131,7 @@ def open_session(
                 on_commit=_ignore if rounds is None else rounds.committed,
                 supervisor=supervisor,
                 context=logged.read,
+                feed=feed,
             )
             try:
                 trials = run_request.due_trials(campaign)
@@ -226,6 +230,7 @@ class TrialCollector:
         on_commit: called after each trial that was committed.
         supervisor: asked before each attempt and notified after each trial, if there is one.
         context: returns what people have logged by now of skin, temperature and so on, by name.
+        feed: shows the trials to those who watch, if there is one.
         taken, retaken: attempts so far, and those of them that repeat one.
     """
 
@@ -238,6 +243,7 @@ class TrialCollector:
     on_commit: Callable[[Trial], None] = _ignore
     supervisor: CollectionSupervisor | None = None
     context: Callable[[], dict[str, str]] = dict
+    feed: LiveFeed | None = None
     taken: int = 0
     retaken: int = 0
     _previous: Trial | None = None
@@ -370,8 +376,9 @@ class TrialCollector:
         try:
             seed = hash_integer(trial.seed, number)
             stopping.check()
+            sink, on_step = self._watched(trial, number, writer)
             run = self.rig.run_trial(
-                self.plan.program(trial), writer, seed, frame_px, rate_hz, with_events
+                self.plan.program(trial), sink, seed, frame_px, rate_hz, with_events, on_step
             )
             found = assess(
                 writer.seal(),
@@ -398,6 +405,16 @@ class TrialCollector:
             self._abandon(writer, error)
             raise
         return found.passed
+
+    def _watched(
+        self, trial: Trial, number: int, writer: TrialWriter
+    ) -> tuple[Sink, Callable[[Step], None]]:
+        """Return the sink of an attempt, and what is called with each of its steps."""
+        if self.feed is None:
+            return writer, ignore_step
+        camera = self.rig.event_camera
+        event_px = None if camera is None else (camera.width, camera.height)
+        return self.feed.begin(trial, number, writer, event_px), self.feed.on_step
 
     def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
         """Quarantine the data written of a trial, with the cause, as far as the disk allows.

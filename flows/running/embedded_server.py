@@ -8,6 +8,7 @@ It starts while its parent does other things: only asking for its `url` waits fo
 out, so that it keeps up with short trials, is in `LEAN`.
 
 It asks every client for a password, and answers no page but its own (docs/decisions/prefect.md).
+That of a service shares its port with the web application (`forward`).
 
 Run as a module it is the server; imported it starts one.
 """
@@ -29,6 +30,7 @@ import sys
 import time
 import urllib.request
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,22 @@ _direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opener for the loopback, which ignores proxies of the environment."""
 
 
+WEB, PUBLIC = "SLIPLAB_WEB_SOCKET", "SLIPLAB_PUBLIC_URL"
+
+
+@dataclass(frozen=True)
+class WebFront:
+    """The web application that shares a server's port.
+
+    Attributes:
+        socket: on which its program listens.
+        public: address of a reverse proxy, such as ``https://lab.example``; empty without one.
+    """
+
+    socket: Path
+    public: str = ""
+
+
 class ServerError(RuntimeError):
     """The embedded server did not start; the message says where its log is."""
 
@@ -68,13 +86,20 @@ class EmbeddedServer:
         port: where; 0 for a free one.
         page: whether it has Prefect's page, and all of its services with it.
         password: that its clients must know (PREFECT_API_AUTH_STRING); by default a new one.
+        front: the web application that gets all paths but Prefect's.
 
     Raises:
         ServerError: the port is taken, or it did not start.
     """
 
     def __init__(
-        self, home: Path, port: int = 0, *, page: bool = False, password: str | None = None
+        self,
+        home: Path,
+        port: int = 0,
+        *,
+        page: bool = False,
+        password: str | None = None,
+        front: WebFront | None = None,
     ) -> None:
         self.password = password or new_password()
         self._log = home / "server.log"
@@ -103,7 +128,7 @@ class EmbeddedServer:
                 stdout=log,
                 stderr=log,
                 pass_fds=[handle],
-                env={**kind, **retained, **_closed(self.port, self.password)},
+                env={**kind, **retained, **_closed(self.port, self.password, front)},
             )
             os.close(handle)
         self._answers = False
@@ -200,14 +225,18 @@ def new_password() -> str:
     return f"sliplab:{secrets.token_urlsafe(32)}"
 
 
-def _closed(port: int, password: str) -> dict[str, str]:
-    """Prefect's settings of a server for those who have its password, whatever else is set."""
+def _closed(port: int, password: str, front: WebFront | None) -> dict[str, str]:
+    """Settings of a server for those who have its password, whatever else is set."""
     own = f"http://127.0.0.1:{port}"
+    public = "" if front is None else front.public
     return {
+        WEB: "" if front is None else str(front.socket),
+        PUBLIC: public,
         "PREFECT_SERVER_API_AUTH_STRING": password,
-        "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": f"{own},http://localhost:{port}",
+        "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": f"{own},http://localhost:{port}"
+        + (f",{public}" if public else ""),
         "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
-        "PREFECT_SERVER_UI_API_URL": f"{own}/api",
+        "PREFECT_SERVER_UI_API_URL": f"{public or own}/api",
     }
 
 
@@ -224,9 +253,14 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     import uvicorn
     from prefect.server.api.server import create_app
 
+    from sliplab.flows.running.forward import Forward
+
     prepare_database(home)
     with socket.socket(fileno=handle) as listener:
-        app = SameOrigin(create_app(), listener.getsockname()[1])
+        app = create_app()
+        if socket_path := os.environ.get(WEB):
+            app = Forward(app, Path(socket_path))
+        app = SameOrigin(app, listener.getsockname()[1], os.environ.get(PUBLIC, ""))
         uvicorn.Server(uvicorn.Config(app, log_level="error")).run(sockets=[listener])
 
 

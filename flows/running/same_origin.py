@@ -25,16 +25,22 @@ def own_hosts(port: int) -> frozenset[str]:
     return frozenset(hosts | set(_NAMES) if port == _HTTP_PORT else hosts)
 
 
-def refusal(hosts: list[str], origins: list[str], own: frozenset[str]) -> tuple[int, str]:
+def refusal(
+    hosts: list[str], origins: list[str], own: frozenset[str], public: str = ""
+) -> tuple[int, str]:
     """Status and text for a request that is refused; status 0 for one that is not.
 
     Args:
         hosts: the values of its `Host`; origins: those of its `Origin`.
         own: the server's `own_hosts`.
+        public: origin of a reverse proxy, such as ``https://lab.example``, that passes `Host` and
+            `Origin` on; empty without one.
     """
-    if len(hosts) != 1 or hosts[0].lower() not in own:
+    through_proxy = bool(public) and hosts == [public.partition("://")[2]]
+    if not through_proxy and (len(hosts) != 1 or hosts[0].lower() not in own):
         return 421, "this server accepts requests to its own address only\n"
-    if any(origin.removeprefix("http://") not in own for origin in origins):
+    known = {public} if through_proxy else {f"http://{host}" for host in own}
+    if any(origin not in known for origin in origins):
         return 403, "this server accepts no requests from other pages\n"
     return 0, ""
 
@@ -47,10 +53,11 @@ class SameOrigin:
 
     Args:
         port: the one that the server listens on.
+        public: as of `refusal`.
     """
 
-    def __init__(self, app: ASGIApp, port: int) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, port: int, public: str = "") -> None:
+        self._app, self._public = app, public
         self._hosts = own_hosts(port)
         reached = " ".join(
             f"{kind}://{host}" for host in sorted(self._hosts) for kind in _KINDS if "[" not in host
@@ -67,7 +74,7 @@ class SameOrigin:
             await self._app(scope, receive, send)
             return
         hosts, origins = _values(scope, b"host"), _values(scope, b"origin")
-        status, text = refusal(hosts, origins, self._hosts)
+        status, text = refusal(hosts, origins, self._hosts, self._public)
         if not status:
             await self._app(scope, receive, _with(send, self._headers))
         elif scope["type"] == "websocket":

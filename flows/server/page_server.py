@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import re
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -18,9 +16,14 @@ from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, build_opener
 
 from sliplab.flows.running import console, run_records
-from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError, new_password
+from sliplab.flows.running.embedded_server import (
+    EmbeddedServer,
+    ServerError,
+    WebFront,
+    new_password,
+)
+from sliplab.flows.running.private_file import stored_secret
 from sliplab.protocols import InputError
-from sliplab.storage.files import write_bytes
 
 PASSWORD = "page-password"
 """The file in Prefect's home that has the password of the service's own page."""
@@ -36,12 +39,15 @@ MISSES = 3
 class PageServer:
     """A server of our own with its page, which can be restarted at the same port.
 
+    Args:
+        front: the web application that has the same port.
+
     Raises:
         ServerError: the port is taken.
     """
 
-    def __init__(self, home: Path, port: int, password: str) -> None:
-        self._make = partial(EmbeddedServer, home, page=True, password=password)
+    def __init__(self, home: Path, port: int, password: str, front: WebFront) -> None:
+        self._make = partial(EmbeddedServer, home, page=True, password=password, front=front)
         self.server = self._make(port)
 
     async def renew(self) -> None:
@@ -95,7 +101,7 @@ async def _answers() -> bool:
 
 
 @contextmanager
-def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
+def page_server(port: int, front: WebFront) -> Iterator[tuple[str, PageServer | None]]:
     """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
 
     Ours asks for a password, which the processes of the runs find in their environment and people
@@ -114,13 +120,15 @@ def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
         yield url, None
         return
     home = Path(os.environ["PREFECT_HOME"])
-    page = PageServer(home, port, page_password(home))
+    page = PageServer(home, port, page_password(home), front)
     before = dict(os.environ)
     try:
         settings = page.server.settings()
         os.environ.update({setting.name: value for setting, value in settings.items()})
         with temporary_settings(updates=settings):
-            console.say(f"the page's password is in {home / PASSWORD}, readable only by you")
+            console.say(
+                f"the password of Prefect's page is in {home / PASSWORD}, readable only by you"
+            )
             yield page.server.url, page
     finally:
         for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
@@ -167,28 +175,4 @@ def page_password(home: Path) -> str:
     Raises:
         InputError: it cannot be stored where only this user can read it.
     """
-    path = home / PASSWORD
-    with suppress(OSError, UnicodeDecodeError):
-        if _private(path) and re.fullmatch(_PASSWORD, saved := path.read_text().strip()):
-            return saved
-    password = new_password()
-    try:
-        write_bytes(path, f"{password}\n".encode(), mode=0o600)
-        private = _private(path)
-    except OSError as error:
-        raise InputError(path, "", None, f"cannot be written: {error.strerror}") from None
-    if not private:
-        path.unlink()
-        raise InputError(
-            path,
-            "",
-            None,
-            "can be read by other users on this file system; name another folder in PREFECT_HOME",
-        )
-    return password
-
-
-def _private(path: Path) -> bool:
-    found = path.lstat()
-    alone = stat.S_ISREG(found.st_mode) and not found.st_mode & 0o077
-    return alone and found.st_uid == os.getuid()
+    return stored_secret(home / PASSWORD, _PASSWORD, new_password)

@@ -8,16 +8,21 @@ import signal
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import urlsplit
 from uuid import UUID
 
 from sliplab import protocols
 from sliplab.flows.running import console, run_records
-from sliplab.flows.server.alerting import keep_alerting
+from sliplab.flows.running.embedded_server import WebFront
+from sliplab.flows.server.helpers import keep_running
 from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
 from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
-from sliplab.flows.server.service import Service
+from sliplab.flows.server.service import Service, deployment_name
+from sliplab.flows.web.access import ROLES
+from sliplab.flows.web.links import Links
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import Store
@@ -25,6 +30,8 @@ from sliplab.storage.trials.store import Store
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
+AGAIN_S = {"page": 5.0, "alerts": 60.0}
+"""Wait before a program beside the service is started again, s."""
 POLL_S = 1.0
 """Longest interval between polls for runs, s: a request to the arm must not wait."""
 
@@ -39,6 +46,8 @@ def serve(
     port: int = PORT,
     poll_s: float = 3.0,
     alerts: Path | None = None,
+    shown: Path | None = None,
+    public: str = "",
 ) -> None:
     """Register the deployments and run what is requested, until SIGINT or SIGTERM.
 
@@ -47,9 +56,11 @@ def serve(
         name: of the service; those of its deployments end in it.
         folders: below which a run may name its protocol; a relative name is of the first. Those
             that ship, and those that a schedule names, it may name as well.
-        port: of the embedded server's page.
+        port: of the page, and of the embedded server.
         poll_s: how often the server is polled for new runs, s.
-        alerts: a file with the section ``alerts:``, which another program sends (`alerting`).
+        alerts: a file with the section ``alerts:``, which another program sends (`helpers`).
+        shown: the file of the schedules, for the page.
+        public: origin of a reverse proxy to the page; empty without one.
 
     Raises:
         Locked: another program serves this store.
@@ -61,16 +72,29 @@ def serve(
     ours = PREFECT_API_URL.value() is None
     with ExitStack() as stack:
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
-        url, page = stack.enter_context(page_server(port))
+        # short: a socket's path has 107 bytes at most
+        folder = stack.enter_context(TemporaryDirectory(prefix="sliplab-web-"))
+        front = WebFront(Path(folder) / "web", public)
+        url, page = stack.enter_context(page_server(port, front))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
         urls = tuple(item.parameters["url"] for item in schedules if "url" in item.parameters)
-        folder = str(store.folder.resolve())
-        here = Service(folder, rig, name, server, os.getpid(), protocols, urls)
+        at = str(store.folder.resolve())
+        here = Service(at, rig, name, server, os.getpid(), protocols, urls)
         here.export_environment()
         for item in run_records.close_killed_runs(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
-        asyncio.run(_serve(here, schedules, url, page, poll_s, alerts))
+        if page is None:
+            place = ("--port", str(_beside(url, port)), "--public-url", public)
+        else:
+            links = Links(Path(os.environ["PREFECT_HOME"]))
+            links.write(public or run_records.server_name(url))
+            place = ("--socket", str(front.socket))
+        programs = [("page", str(store.folder), *place)]
+        programs[0] += ("--schedules", str(shown)) if shown is not None else ()
+        if alerts is not None:
+            programs.append(("alerts", str(store.folder), str(alerts)))
+        asyncio.run(_serve(here, schedules, url, page, poll_s, programs))
 
 
 async def _serve(
@@ -79,7 +103,7 @@ async def _serve(
     url: str,
     page: PageServer | None,
     poll_s: float,
-    alerts: Path | None,
+    programs: Sequence[tuple[str, ...]],
 ) -> None:
     from prefect.settings import (
         PREFECT_API_REQUEST_TIMEOUT,
@@ -122,19 +146,30 @@ async def _serve(
             asyncio.create_task(each.carry_out(min(poll_s, POLL_S), stopped)) for each in lanes
         ]
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
-    alerting = asyncio.create_task(keep_alerting(here.folder, alerts, stopped))
+    helping = [
+        asyncio.create_task(keep_running(words, stopped, again_s=AGAIN_S[words[0]]))
+        for words in programs
+    ]
     ending = asyncio.create_task(stopped.wait())
     shown = ", ".join(deployment_name(flow.name, here.name) for flow in (ON_RIG[0], *CONTROL))
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments {shown} and others")
-    console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
+    home = Path(os.environ["PREFECT_HOME"])
+    files = " and ".join(str(Links(home).file(role)) for role in ROLES)
+    console.say(f"the page's links, readable only by you: {files}")
+    console.say(f"Prefect's page: {run_records.server_name(url)}/v2/; Ctrl-C ends")
     await asyncio.wait([ending, *working], return_when=asyncio.FIRST_COMPLETED)
     console.say("stopping: the arm first, then all runs")
     stopped.set()
     for outcome in await asyncio.gather(
-        *working, watching, alerting, ending, return_exceptions=True
+        *working, watching, *helping, ending, return_exceptions=True
     ):
         if isinstance(outcome, Exception):
             raise outcome
+
+
+def _beside(url: str, port: int) -> int:
+    """Return the page's port where the user's own Prefect server has that of `url`."""
+    return port + 1 if port and urlsplit(url).port == port else port
 
 
 def _protocols(folders: Sequence[Path], schedules: Sequence[Scheduled]) -> tuple[str, ...]:
@@ -164,11 +199,6 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
         )
         for item in schedules
     ]
-
-
-def deployment_name(flow: str, name: str) -> str:
-    """Return the name of a flow's deployment, which begins with what it does: ``stop NAME``."""
-    return f"{flow} {name}"
 
 
 async def _refuse_another(flow: str, name: str, store: Path) -> None:

@@ -102,3 +102,8 @@ def service() -> Service:
     given = json.loads(text)
     lists = {name: tuple(given[name]) for name in ("protocols", "urls")}
     return Service(**{**given, **lists})
+
+
+def deployment_name(flow: str, name: str) -> str:
+    """Return the name of a flow's deployment, which begins with what it does: ``stop NAME``."""
+    return f"{flow} {name}"

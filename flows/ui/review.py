@@ -1,35 +1,29 @@
-"""Labels to review: the list of trials, one trial's data, and a reviewer's verdict.
+"""Labels to review: the list of trials, and a reviewer's verdict.
 
 The list is made from small JSON files only, so that a whole campaign is listed at once. It is made
 again when something it depends on has changed, such as a decision of another reviewer, or a trial
-that a running campaign has committed. A trial's data are loaded when it is chosen.
+that a running campaign has committed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Literal
-
-import numpy as np
 
 from sliplab.analysis.campaigns import Collected, has_plan, need_slip
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
-from sliplab.analysis.review.doubt import reasons_for_doubt, suggested_onsets
+from sliplab.analysis.review.doubt import reasons_for_doubt
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.adapter import CLASSES
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials import review
-from sliplab.storage.trials.derived import Arrays, Derived
-from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import Decision, ReviewedOnsets, Verdict
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.video import FrameReader
 
 LabelState = Literal["fresh", "stale", "missing"]
 
@@ -120,7 +114,11 @@ def row_of(store: Store, item: Collected, trial: str, order: int) -> ReviewRow:
 
 
 class TrialList:
-    """The rows of a store; `refresh` makes those again that may have changed."""
+    """The rows of a store; `refresh` makes those again that may have changed.
+
+    Attributes:
+        changes: a number that grows whenever a row changes.
+    """
 
     def __init__(self, store: Store, campaigns: Sequence[str] = ()) -> None:
         self.store = store
@@ -129,6 +127,7 @@ class TrialList:
         self._ranks: Mapping[tuple[str, str], int] = {}
         self.items: dict[str, Collected] = {}
         self.rows: list[ReviewRow] = []
+        self.changes = 0
         self.refresh()
 
     def refresh(self) -> bool:
@@ -170,19 +169,34 @@ class TrialList:
                 except StoreError:
                     continue  # it was damaged or taken away in the meantime: `verify` names it
         self.items, self.rows, self._folders = items, rows, folders
+        self.changes += 1
         return True
+
+    def row(self, campaign: str, trial: str) -> ReviewRow:
+        """Return the row of a trial.
+
+        Raises:
+            StoreError: it is not in the list.
+        """
+        for row in self.rows:
+            if row.name == (campaign, trial):
+                return row
+        raise StoreError(f"{campaign} / {trial}: is not in the list of trials to review")
 
     def renew(self, row: ReviewRow) -> ReviewRow:
         """Make the row of a trial again."""
         item = self.items[row.campaign]
         fresh = self._ranked(row_of(self.store, item, row.trial, row.order))
-        self.rows = [fresh if other.name == row.name else other for other in self.rows]
+        if fresh != row:
+            self.rows = [fresh if other.name == row.name else other for other in self.rows]
+            self.changes += 1
         return fresh
 
     def rank(self, names: Sequence[tuple[str, str]]) -> None:
         """List trials, by campaign and id, in this order, and others behind them."""
         self._ranks = {name: place for place, name in enumerate(names)}
         self.rows = [self._ranked(row) for row in self.rows]
+        self.changes += 1
 
     @property
     def ranked(self) -> bool:
@@ -243,177 +257,26 @@ def _waits(row: ReviewRow) -> bool:
     return row.state in {"open", "stale"}
 
 
-def as_columns(rows: Sequence[ReviewRow]) -> dict[str, list[str]]:
-    """Return the rows as columns of the page's table."""
-    return {
-        "trial": [row.trial for row in rows],
-        "campaign": [row.campaign for row in rows],
-        "state": [row.status for row in rows],
-        "doubt": ["?" * row.severity for row in rows],
-        "reasons": ["; ".join((row.campaign, *row.reasons)) for row in rows],
-    }
-
-
-RATE_NS = 10_000_000
-"""Width of a bin of the event rate."""
-
-
-@dataclass
-class ShownTrial:
-    """The data of a trial that the page shows. Times: seconds on the time line unless in ns.
-
-    Attributes:
-        label: its label, None where it has none; label_key: the label's own key.
-        frame_ns: (n,) int64; displacement_px: (n, m), NaN where unknown; both empty without label.
-        xy_px: (n, m, 2) places of the markers, NaN where lost; None where they were not stored.
-        plate_px: (n, 2) the same of the plate's marker; None without.
-        rate_s: (k,) middle of each bin of 10 ms; rate: (k,) events a second.
-        span_s: start and end of the recording; motion_s: of the slide or retraction.
-    """
-
-    row: ReviewRow
-    item: Collected
-    recording: Recording
-    label: TrialLabel | None
-    frame_ns: I64
-    displacement_px: F64
-    xy_px: F64 | None
-    plate_px: F64 | None
-    rate_s: F64
-    rate: F64
-    span_s: tuple[float, float]
-    motion_s: tuple[float, float]
-    _reader: FrameReader | None = field(default=None, repr=False)
-
-    @property
-    def label_key(self) -> str:
-        """The key of the label that is shown; empty without one."""
-        return "" if self.label is None else self.label.key
-
-    @property
-    def centre(self) -> int:
-        """Index of the centre marker."""
-        return self.recording.record.geometry.centre
-
-    @property
-    def threshold_px(self) -> float:
-        """Displacement that counts as slip."""
-        return self.item.settings.labelling.threshold_px
-
-    @cached_property
-    def frame_s(self) -> F64:
-        """(n,) float64, the frames' times."""
-        return self.frame_ns / 1e9
-
-    @property
-    def onsets(self) -> ReviewedOnsets:
-        """The label's onsets."""
-        if self.label is None:
-            return ReviewedOnsets()
-        return ReviewedOnsets(self.label.incipient_ns, self.label.gross_ns)
-
-    @property
-    def suggested(self) -> ReviewedOnsets:
-        """Onsets by the markers that were seen, also where the label is in doubt."""
-        return ReviewedOnsets() if self.label is None else suggested_onsets(self.label, self.centre)
-
-    def frame_at(self, time_s: float) -> int:
-        """Return the index of the frame nearest to a time; -1 without frames."""
-        if not len(self.frame_ns):
-            return -1
-        return int(np.argmin(np.abs(self.frame_ns - round(time_s * 1e9))))
-
-    def picture(self, index: int) -> U8 | None:
-        """Return a frame of the video, uint8 (height, width); None if none was stored."""
-        if not self.recording.has_video:
-            return None
-        if self._reader is None:
-            self._reader = self.recording.frame_reader()
-        return self._reader.frame(index)
-
-    def places(self, index: int) -> F64:
-        """Return the positions of the markers in a frame, (m, 2) px, NaN where lost; m may be 0."""
-        return np.empty((0, 2)) if self.xy_px is None else self.xy_px[index]
-
-    def close(self) -> None:
-        """Close the video."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
-
-
-def load_trial(store: Store, item: Collected, row: ReviewRow) -> ShownTrial:
-    """Read the displayed data of a trial; frames are read later, one at a time.
-
-    Raises:
-        StoreError: the trial is damaged.
-    """
-    recording = item.campaign.recording(row.trial)
-    derived = Derived.of(store, LABELS, item.name)
-    label: TrialLabel | None = None
-    arrays: Arrays = {}
-    if row.label != "missing":
-        label, arrays = derived.load(row.trial, TrialLabel), derived.arrays(row.trial)
-    frame_ns = np.empty(0, np.int64)
-    if "frame_ns" in arrays:
-        frame_ns = np.asarray(arrays["frame_ns"], np.int64)
-    elif recording.frame_source != "none":
-        frame_ns = recording.frame_times()
-    moved = np.asarray(arrays.get("displacement_px", np.empty((len(frame_ns), 0))), np.float64)
-    places, plate = arrays.get("xy_px"), arrays.get("plate_px")
-    if places is None and recording.has_tracks:
-        tracks = recording.tracks()
-        places, plate = tracks.markers_px, tracks.plate_px
-    start, end = recorded_span(recording)
-    motion = recording.motion_ns
-    rate_s, rate = event_rate(recording, start, end)
-    return ShownTrial(
-        row,
-        item,
-        recording,
-        label,
-        frame_ns,
-        moved,
-        None if places is None else np.asarray(places, np.float64),
-        None if plate is None else np.asarray(plate, np.float64),
-        rate_s,
-        rate,
-        (start / 1e9, end / 1e9),
-        (motion[0] / 1e9, motion[1] / 1e9),
-    )
-
-
-def event_rate(recording: Recording, start_ns: int, end_ns: int) -> tuple[F64, F64]:
-    """Return events per second in bins of 10 ms from the recording's start, whole bins only.
-
-    Returns:
-        (k,) float64 middle of each bin, s; (k,) float64 events a second.
-    """
-    bins = max(0, (end_ns - start_ns) // RATE_NS)
-    edges = start_ns + np.arange(bins + 1, dtype=np.int64) * RATE_NS
-    device_us = -(-np.asarray(recording.clock("events").to_device(edges)) // 1000)
-    with recording.open() as reader:
-        times = reader.event_times()
-    counted = np.diff(np.searchsorted(times, device_us, "left"))
-    return (edges[:-1] + RATE_NS // 2) / 1e9, counted * (1e9 / RATE_NS)
-
-
 class LabelChanged(ValueError):
     """The label is not the one that the reviewer saw."""
 
 
 def record_verdict(
     trials: TrialList,
-    shown: ShownTrial,
+    row: ReviewRow,
     verdict: Verdict,
     lines: ReviewedOnsets,
+    *,
+    label: str,
+    seen: int,
     who: str,
     why: str,
 ) -> Decision:
-    """Store a verdict on the trial and label that are shown.
+    """Store a verdict on a trial and its label.
 
     Args:
         lines: where the onset lines are; they count for ``adjust`` only.
+        label: key of the label that the reviewer saw; seen: number of the last decision, likewise.
 
     Raises:
         LabelChanged: the label on the disk is another one by now, or out of date.
@@ -421,22 +284,25 @@ def record_verdict(
         ValueError: onsets that cannot be, or a rejection without a reason.
         OSError: it cannot be written.
     """
-    now = trials.renew(shown.row)
-    if now.label != "fresh" or now.key != shown.label_key:
+    now = trials.renew(row)
+    if now.label != "fresh" or now.key != label:
         raise LabelChanged("the label has changed in the meantime; review it again")
-    new = {"adjust": lines, "reject": ReviewedOnsets()}.get(verdict, shown.onsets)
+    found = Derived.of(trials.store, LABELS, row.campaign).load(row.trial, TrialLabel)
+    old = ReviewedOnsets(found.incipient_ns, found.gross_ns)
+    new = {"adjust": lines, "reject": ReviewedOnsets()}.get(verdict, old)
+    start, end = recorded_span(trials.items[row.campaign].campaign.recording(row.trial))
     for kind, time in vars(new).items():
-        if time is not None and not shown.span_s[0] <= time / 1e9 <= shown.span_s[1]:
+        if time is not None and not start <= time <= end:
             name = kind.removesuffix("_ns")
             raise ValueError(f"the {name} onset lies outside the recording")
     return review.decide(
         trials.store,
-        *shown.row.name,
+        *row.name,
         verdict,
-        label=shown.label_key,
-        old=shown.onsets,
+        label=label,
+        old=old,
         new=new,
-        seen=shown.row.decisions,
+        seen=seen,
         who=who.strip(),
         why=why,
     )

@@ -38,7 +38,7 @@ from sliplab.analysis.labels.reviewed import label_key, state_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.running import stopping
-from sliplab.flows.ui.review import RATE_NS, event_rate
+from sliplab.flows.ui.trial_data import RATE_NS, event_rate
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import Child, start_tethered

@@ -129,6 +129,10 @@ class TouchedZero:
     """None of a single touch."""
 
 
+def ignore_step(step: Step) -> None:
+    """Take no note of a step."""
+
+
 @dataclass
 class Rig:
     """Arm, cameras, sync box and the other parts that a trial needs.
@@ -300,12 +304,14 @@ class Rig:
         frame_px: tuple[int, int] | None,
         rate_hz: int,
         with_events: bool = True,
+        on_step: Callable[[Step], None] = ignore_step,
     ) -> TrialRun:
         """Run one trial; the streams of its recorded steps go to `sink`.
 
         Args:
             frame_px: region of the frames that are recorded; None records none.
             with_events: record events, where the rig has an event camera.
+            on_step: called with each step before it is carried out.
 
         Raises:
             StopRequested: `should_stop` became true; the arm is stopped and clear.
@@ -331,6 +337,7 @@ class Rig:
                     recording = False
                 if step.phase in ACTING and not reference:
                     reference = self.arm.now_ns()
+                on_step(step)
                 times = self.take_step(index, step, began, sink if recording else None)
                 steps.append((times, step.recorded))
                 course.taken(step, self.position)

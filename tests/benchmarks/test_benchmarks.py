@@ -24,6 +24,7 @@ TINY: dict[str, dict[str, Any]] = {
     "acquisition": {"seconds": 0.5, "events_per_s": 100_000, "size": 96, "pictures": 4}
     | {"saturating": 20},
     "exchange_memory": {"events": 20_000, "forms": ("dsec",)},
+    "page": {"runs": 1, "seconds": 3.0},
     "fewer": {"worlds": 1, "adaptive": 1, "cores": 1},
     "statements": {"campaigns": 1, "cores": 1},
 }
@@ -45,6 +46,7 @@ PROMISED = {
     "labels": {"x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime"}
     | {"aruco_x_realtime"},
     "exchange_memory": {"dsec_import_peak_mb", "dsec_export_peak_mb"},
+    "page": {"page_core_percent", "page_memory_mb", "watched_over_alone", "pictures_per_s"},
     "fewer": {f"{way}_worst_claim_wrong_percent" for way in ("shuffled", "adaptive")}
     | {f"{way}_true_trials_percent" for way in ("shuffled", "adaptive")}
     | {"adaptive_over_shuffled"},
@@ -55,7 +57,7 @@ PROMISED = {
         "16 clusters, 50% of the variance between worlds: held_percent",
     },
 }
-MARKS = dict.fromkeys(("scene", "fewer", "statements", "orchestration"), pytest.mark.long)
+MARKS = dict.fromkeys(("scene", "fewer", "statements", "orchestration", "page"), pytest.mark.long)
 MARKS["acquisition"] = pytest.mark.realtime
 """The scene's takes longest to compile, and is all of it elsewhere in the tests; `fewer` has whole
 campaigns, and `orchestration` servers."""

@@ -16,8 +16,8 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.ui.review import TrialList, load_trial
-from sliplab.flows.ui.review_plots import FramePlot
+from sliplab.flows.ui.trial_data import load_trial
+from sliplab.flows.web.trial_curves import frame_html
 from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import KINDS, TrialLabel
 from sliplab.storage.streams import EventChunk
@@ -216,18 +216,15 @@ def test_the_document_says_that_it_is_from_events(unseen: Store) -> None:
 
 
 def test_a_reviewer_sees_the_markers_where_the_event_camera_does(unseen: Store) -> None:
-    store, plot = unseen, FramePlot()
-    bare = TrialList(store)
-    shown = load_trial(store, bare.items["pilot"], bare.rows[0])
-    assert shown.displacement_px.shape == (0, 0)
-    plot.frame_to(shown)
-    label(store, collected(store))
-    trials = TrialList(store)
-    shown = load_trial(store, trials.items["pilot"], trials.rows[0])
-    plot.frame_to(shown)
-    assert (plot.plot.x_range.end, plot.plot.y_range.end) == (640, 480)
-    said = plot.draw(shown, 1000, shown.picture(1000))
-    assert "as the event camera sees the markers" in said
+    store = unseen
+    (item,) = collected(store)
+    trial = item.trials[0][1].trial_id
+    assert load_trial(store, item, trial).displacement_px.shape == (0, 0)
+    label(store, [item])
+    shown = load_trial(store, item, trial)
+    found = frame_html(shown, 1000)
+    assert "viewBox='-0.5 -0.5 640 480'" in found
+    assert "as the event camera sees the markers" in found
     assert shown.places(1000)[0] == pytest.approx([319.5, 239.5], abs=60.0)
 
 

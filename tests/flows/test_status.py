@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.analysis.references import ReferenceDrift
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.status import StatusReader, night_of, nights_needed, pace_of
+from sliplab.flows.status import StatusReader, night_of, nights_needed, pace_error, paces_of
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE
@@ -129,10 +129,21 @@ def test_the_pace_leaves_out_what_came_between_two_trials(tmp_path: Path) -> Non
     first, second, third = work.plan
     seconds = work.plan.seconds(second)
     times = {first.id: EVENING, second.id: EVENING + timedelta(seconds=2 * seconds)}
-    assert pace_of(work.plan, {first.id: EVENING}) is None
-    assert pace_of(work.plan, times) == pytest.approx(2)
+    assert paces_of(work.plan, {first.id: EVENING}) == []
+    assert paces_of(work.plan, times) == [pytest.approx(2)]
     times[third.id] = EVENING + timedelta(hours=10)  # a person changed the skin
-    assert pace_of(work.plan, times) == pytest.approx(2)
+    assert paces_of(work.plan, times) == [pytest.approx(2)]
+
+
+def test_pace_error_shrinks_with_trials() -> None:
+    paces = [1.0, 1.2, 0.9, 1.1]
+    assert pace_error(paces[:3], 10) is None
+    assert pace_error(paces, 0) is None
+    few, many = pace_error(paces, 100), pace_error(paces * 10, 100)
+    assert few is not None
+    assert many is not None
+    assert few == pytest.approx(2.353 * 0.1291 * (1 / 100 + 1 / 4) ** 0.5, rel=1e-3)
+    assert many < few / 2
 
 
 @pytest.mark.parametrize(

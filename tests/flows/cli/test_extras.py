@@ -126,11 +126,11 @@ LACKING: dict[str, dict[str, str]] = {
     "prefect": {
         "label STORE": "prefect",
         "sync STORE": "prefect",
+        "review STORE": "starlette",
         "collect pilot --rig rehearsal --store OUT/new --trials 1": "prefect",
     },
     "report": {
         "sync STORE": "matplotlib",
-        "review STORE": "bokeh",
         "calibrate board --out OUT/board.pdf": "matplotlib",
     },
     "hardware": {

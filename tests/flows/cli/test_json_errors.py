@@ -18,6 +18,7 @@ from sliplab.flows.running.cluster import ClusterError
 from sliplab.rigs.core.capabilities import ArmFault
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Store
+from tests.analysis.labels.reviewable import Reviewable
 from tests.command_line import SECRET, here
 from tests.conftest import ROOT
 
@@ -163,16 +164,14 @@ def test_one_object_after_a_result_was_printed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Review prints its address first; what ends it later must not be a second object."""
-    from sliplab.flows.ui import review_server
+    from sliplab.flows.web import serving
 
-    def serve(*arguments: Any) -> None:
-        *_, ready = arguments
-        ready("http://127.0.0.1:1/x", type("Trials", (), {"rows": ()})())
+    def serve(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(review_server, "serve", serve)
-    Store.create(tmp_path / "s")
-    done = here("review", tmp_path / "s", "--json")
+    monkeypatch.setattr(serving, "serve", serve)
+    made = Reviewable(tmp_path / "s", 1)
+    done = here("review", made.store.folder, "--json")
     assert done.returncode == 130
     assert list(json.loads(done.stdout)) == ["url", "trials", "to_decide"]
 

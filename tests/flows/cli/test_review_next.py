@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from bokeh.document import Document
 
 from sliplab.flows.ui.review import TrialList, filtered_rows
-from sliplab.flows.ui.review_tab import ReviewTab
-from sliplab.storage.trials.store import Store
+from sliplab.flows.web import serving
+from sliplab.flows.web.web import Web
 from tests.analysis.review.evaluated import Evaluated
 from tests.command_line import here
+from tests.flows.web.opened import opened
 
 
 @pytest.fixture(scope="module")
@@ -89,26 +87,23 @@ def test_the_page_lists_in_this_order(made: Evaluated) -> None:
     made.change(one, flags=["knocked"])
     assert trials.refresh()
     assert filtered_rows(trials.rows)[0].trial == one
-    with ThreadPoolExecutor(1) as pool:
-        page = ReviewTab(Document(), trials, pool, "anna")
-        assert page.see.source.data["trial"][:2] == [one, made.tests[5]]
-        assert page.see.first.label == "most change first"
-        page.close()
+    page = opened(made.store, trials)
+    rows = page.get("/review/rows?first=on").json()["rows"]
+    assert [trial for _, trial, *_ in rows][:2] == [one, made.tests[5]]
+    assert "most change first" in page.get("/review").text
 
 
 def test_opened_with_it_the_page_has_the_order(
     made: Evaluated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sliplab.flows.ui import review_server
-
-    def serve(store: Store, *others: Any) -> None:
-        trials = TrialList(store)
-        others[-1]("http://127.0.0.1:1/x", trials)
-        assert [row.trial for row in filtered_rows(trials.rows)][:2] == made.tests[1::-1]
+    def serve(web: Web, *_: object) -> None:
+        assert web.reviews is not None
+        assert [row.trial for row in filtered_rows(web.reviews.rows)][:2] == made.tests[1::-1]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(review_server, "serve", serve)
+    monkeypatch.setattr(serving, "serve", serve)
     done = here("review", made.store.folder, "--next", "--json")
     assert done.returncode == 130
     found = json.loads(done.stdout)
-    assert (found["url"], len(found["next"])) == ("http://127.0.0.1:1/x", 2)
+    assert found["url"].endswith("&to=/review")
+    assert len(found["next"]) == 2

@@ -119,10 +119,9 @@ def serving(
     """
     command = [sys.executable, "-m", "sliplab", "serve", "--store", str(store), "--rig", str(rig)]
     command += [] if schedules is None else [str(schedules)]
+    command += ["--port", "0"]
     environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
-    if server is None:
-        command += ["--port", "0"]
-    else:
+    if server is not None:
         environment |= {"PREFECT_API_URL": server[0], "PREFECT_API_AUTH_STRING": server[1]}
     with log.open("w") as output:
         process = subprocess.Popen(

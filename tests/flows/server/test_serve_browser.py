@@ -41,7 +41,7 @@ def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str
             lambda r: outside.append(r.url) if "ERR_NAME_NOT_RESOLVED" in r.failure else None,
         )
         root = page.url.removesuffix("/api").replace("127.0.0.1", host)
-        tab.goto(root)
+        tab.goto(f"{root}/v2/")
         box = tab.get_by_role("textbox")
         box.fill("sliplab:guess")
         box.press("Enter")

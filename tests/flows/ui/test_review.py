@@ -10,7 +10,8 @@ import pytest
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.review.doubt import reasons_for_doubt
 from sliplab.flows.label import report_states
-from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial
+from sliplab.flows.ui.review import TrialList, filtered_rows
+from sliplab.flows.ui.trial_data import load_trial
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import trials_in
@@ -97,7 +98,7 @@ def test_doubts_are_told_once_and_gravest_first() -> None:
 
 def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     trials = TrialList(made.store)
-    shown = load_trial(made.store, made.item, trials.rows[0])
+    shown = load_trial(made.store, made.item, made.ids[0])
     assert shown.displacement_px == pytest.approx(displacements(), abs=1e-6)
     assert shown.xy_px is not None
     assert (shown.xy_px == places()).all()
@@ -108,11 +109,10 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     picture = shown.picture(25)
     assert picture.shape == (120, 120)
     assert picture[60, 60] == 220
-    shown.close()
     # without a label there are still events and frames to see
     Derived.of(made.store, STEP, NAME).folder.joinpath(f"{made.ids[1]}.json").unlink()
     assert trials.refresh()
-    bare = load_trial(made.store, made.item, trials.rows[1])
+    bare = load_trial(made.store, made.item, made.ids[1])
     assert bare.displacement_px.shape == (60, 0)
     assert bare.suggested == ReviewedOnsets()
 

@@ -1,4 +1,4 @@
-"""The service's alerts: sent by a program of its own, which is started again and ends with it."""
+"""Programs beside a service, such as its alerts: started again, and ended with it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.server import alerting
-from sliplab.flows.server.alerting import keep_alerting
+from sliplab.flows.server.helpers import keep_running
 from sliplab.flows.server.schedules import has_alerts, load_schedules
 from sliplab.storage.process import send
 from sliplab.storage.trials.lock import current_holder
@@ -28,19 +27,18 @@ async def holder_of(store: Store, other_than: int | None = None) -> dict[str, ob
             await asyncio.sleep(0.05)
 
 
-def test_alerts_are_started_again_and_end_with_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(alerting, "AGAIN_S", 0.1)
+def test_alerts_are_started_again_and_end_with_the_service(tmp_path: Path) -> None:
     store = Store.create(tmp_path / "s")
     file = tmp_path / "schedules.yaml"
     file.write_text("timezone: UTC\nschedules: []\nalerts: {to: ['json://localhost']}\n")
     assert load_schedules(file) == []
     assert has_alerts(file)
 
+    words = ("alerts", str(store.folder), str(file))
+
     async def run() -> None:
         stopped = asyncio.Event()
-        task = asyncio.create_task(keep_alerting(store.folder, file, stopped))
+        task = asyncio.create_task(keep_running(words, stopped, again_s=0.1))
         first = await holder_of(store)
         assert send(first, signal.SIGKILL)
         second = await holder_of(store, int(str(first["pid"])))
@@ -53,8 +51,7 @@ def test_alerts_are_started_again_and_end_with_the_service(
     asyncio.run(run())
 
 
-def test_without_alerts_nothing_is_started(tmp_path: Path) -> None:
+def test_file_without_alerts_has_none(tmp_path: Path) -> None:
     file = tmp_path / "schedules.yaml"
     file.write_text("timezone: UTC\nschedules: []\n")
     assert not has_alerts(file)
-    asyncio.run(keep_alerting(tmp_path, None, asyncio.Event()))

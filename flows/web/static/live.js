@@ -1,0 +1,60 @@
+// The live page: what the server sends is put in its place.
+import { KINDS, Panels, seconds } from "./plots.js";
+import { localTimes } from "./page.js";
+
+const place = (id) => document.getElementById(id);
+const plots = new Panels(place("curves").querySelector(".plots"), {});
+const source = new EventSource("/live");
+
+const on = (kind, act) => source.addEventListener(kind, (event) => act(event.data));
+
+// a part that has not changed keeps its focus and selection
+for (const kind of ["now", "status"]) on(kind, (text) => {
+  place(kind).innerHTML = text;
+  localTimes(place(kind));
+  count();
+  const trial = document.querySelector("#now .id")?.textContent ?? "";
+  for (const input of document.querySelectorAll("[data-trial]")) if (!input.value) input.placeholder = trial;
+});
+on("problem", (text) => { place("problem").textContent = text; });
+
+on("pictures", (text) => {
+  const found = JSON.parse(text), parent = place("pictures"), names = Object.keys(found);
+  if (names.join() !== [...parent.querySelectorAll("img")].map((image) => image.dataset.name).join())
+    parent.replaceChildren(...names.map((name) => {
+      const figure = document.createElement("figure"), image = document.createElement("img");
+      image.dataset.name = name;
+      image.alt = `last picture of ${name}`;
+      const caption = document.createElement("figcaption");
+      caption.textContent = name;
+      figure.append(image, caption);
+      return figure;
+    }));
+  for (const image of parent.querySelectorAll("img")) image.src = `data:image/jpeg;base64,${found[image.dataset.name]}`;
+});
+
+on("curves", (text) => {
+  const trial = JSON.parse(text), [campaign, name] = trial.trial.split(" / ");
+  place("curves").hidden = false;
+  place("last").textContent = name;
+  place("last").href = `/trials/${encodeURIComponent(campaign)}/${encodeURIComponent(name)}`;
+  const known = [];
+  for (const [from, both] of Object.entries(trial.onsets))
+    for (const kind of KINDS)
+      if (both[`${kind}_ns`] !== null) known.push(`${kind} slip at ${seconds(both[`${kind}_ns`]).toFixed(4)} s (${from === "truth" ? "truth, simulated" : from})`);
+  place("onsets").textContent = known.join("; ") || "No onsets are known yet: `sliplab label` finds them.";
+  plots.show(trial, {});
+});
+
+// how long the trial has run, of how much it was planned for
+function count() {
+  for (const part of document.querySelectorAll("[data-since]")) {
+    const ran = Date.now() / 1000 - Number(part.dataset.since);
+    part.textContent = `${Math.max(0, ran).toFixed(0)} s of ${part.dataset.of} s planned`;
+  }
+}
+setInterval(count, 1000);
+
+source.onerror = () => { place("link").textContent = "The connection is lost; it is tried again."; };
+source.onopen = () => { place("link").textContent = ""; };
+addEventListener("pagehide", () => source.close());

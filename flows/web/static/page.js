@@ -1,0 +1,10 @@
+// Times of the server are UTC: show those of this browser.
+export function localTimes(parent) {
+  for (const time of parent.querySelectorAll("time[datetime]")) {
+    const moment = new Date(time.dateTime);
+    if (Number.isNaN(moment.valueOf())) continue;
+    time.title = time.dateTime;
+    time.textContent = moment.toLocaleString(undefined, { dateStyle: "medium", timeStyle: "medium" });
+  }
+}
+localTimes(document);

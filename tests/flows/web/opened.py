@@ -1,0 +1,30 @@
+"""The web application of a store as a browser gets it that has opened one of its links."""
+
+from __future__ import annotations
+
+from starlette.testclient import TestClient
+
+from sliplab.flows.ui.review import TrialList
+from sliplab.flows.web.access import Access, Role, Viewer
+from sliplab.flows.web.app import application
+from sliplab.flows.web.web import Web
+from sliplab.storage.trials.store import Store
+
+ACCESS = Access({"operator": "o" * 40, "reader": "r" * 40})
+
+
+def opened(
+    store: Store, reviews: TrialList | None = None, role: Role | None = "operator"
+) -> TestClient:
+    """A browser that opened the link of a role, or none."""
+    found = TestClient(application(Web(store, ACCESS, reviews=reviews)), follow_redirects=False)
+    if role is not None:
+        assert found.get(f"/enter?token={ACCESS.tokens[role]}").status_code == 200
+    return found
+
+
+def csrf(browser: TestClient) -> str:
+    """The token of a browser's forms."""
+    viewer = ACCESS.viewer(dict(browser.cookies))
+    assert isinstance(viewer, Viewer)
+    return viewer.csrf
