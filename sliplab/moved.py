@@ -12,6 +12,8 @@ from types import ModuleType
 MOVED = {
     "sliplab.rigs.testing": "sliplab.plugins.driver_kit",
     "sliplab.analysis.bench": "sliplab.plugins.bench",
+    "sliplab.plugins.bench.interface": "sliplab.analysis.detectors.detector",
+    "sliplab.plugins.bench.registry": "sliplab.analysis.detectors.registry",
     "sliplab.protocols.conditions": "sliplab.protocols.model",
     "sliplab.flows.planning.schema": "sliplab.flows.planning.json_schemas",
     "sliplab.flows.ui.review_page": "sliplab.flows.ui.review_tab",

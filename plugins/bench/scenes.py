@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.analysis.detectors.detector import Scene, Slip
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.plugins.bench.definition import DEFINITION, VERSION, ScenePart, Size, Span
-from sliplab.plugins.bench.interface import Scene, Slip
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
 from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan

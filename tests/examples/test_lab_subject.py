@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.detectors.registry import known, make_detector
 from sliplab.analysis.evaluation.classes import class_evaluation_of
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file
@@ -23,7 +24,6 @@ from sliplab.flows.cli import app as cli
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome, searches
-from sliplab.plugins.bench.registry import known, make_detector
 from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.live import Counting
+from sliplab.analysis.detectors.detector import StreamDetector
+from sliplab.analysis.detectors.network_detector import Counting
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
+from sliplab.flows.detecting.sources import NetworkSource
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
@@ -42,6 +44,12 @@ def model_in(folder: Path, outputs: int = 4) -> Path:
     path = folder / "model.pt"
     model_file.save(path, untrained(outputs=outputs))
     return path
+
+
+def scripted(order: DetectRequest, counting: Counting) -> StreamDetector:
+    """The network detector of a request, with another network."""
+    assert isinstance(order.source, NetworkSource)
+    return order.source.detector(counting)
 
 
 def slip_when_busy(most: int = MANY) -> Counting:

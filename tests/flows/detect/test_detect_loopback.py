@@ -13,7 +13,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
-from tests.flows.detect.detecting import model_in, short_slide, slip_when_busy
+from tests.flows.detect.detecting import model_in, scripted, short_slide, slip_when_busy
 from tests.flows.live import rig_yaml, stage_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
@@ -36,7 +36,7 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
         def build(file: RigFile) -> Rig:
             return loopback_rig(file, stage)
 
-        result = detect(order, counting=slip_when_busy(), build=build)
+        result = detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.arm_place()[2] < 0
     assert result["simulated"] is True
     assert result["virtual_time"] is False
@@ -76,7 +76,7 @@ def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path:
         def build(file: RigFile) -> Rig:
             return loopback_rig(file, stage)
 
-        reflex = detect(order, counting=slip_when_busy(), build=build)["reflex"]
+        reflex = detect(order, detector=scripted(order, slip_when_busy()), build=build)["reflex"]
         assert stage.arm_place()[2] < 0
         assert reflex
         # three steps of 1/3 mm are 1 mm, and the driver rounds to the wider opening
@@ -85,6 +85,6 @@ def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path:
         assert not reflex["stalled"]
         stage.inject("gripper", "silence")
         with pytest.raises(RigError, match="gripper: no answer"):
-            detect(order, counting=slip_when_busy(), build=build)
+            detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.at_rest()
     print(f"simulated: {reflex}")

@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from sliplab.analysis.detectors.detectors import Tuned
-from sliplab.analysis.detectors.live import counting_of
 from sliplab.analysis.study import Finding
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome
@@ -53,7 +52,9 @@ def test_who_cries_always_or_never_is_at_the_bottom(
     for detector, counting in countings.items():
         for case in asked.cases:
             if case.reflex is not None:
-                made = flow.measure(asked, case, {name: counting})
+                made = flow.measure(
+                    asked, case, {name: asked.requests[name].source.detector(counting)}
+                )
                 trials.append(made.model_copy(update={"detector": detector}))
     rows = {(row.detector, row.reflex): row for row in reflex_rows(trials)}
     assert rows[None, None].dropped == 1
@@ -102,12 +103,12 @@ def test_a_store_has_all_its_detectors(
     rule, tuned = "network", "cusum counts"
     asked = flow.request(place, RIG, tmp_path, fast, ("stop",), detectors=[rule, tuned])
     assert [it.detector for it in asked.cases] == [None, rule, tuned]
-    assert isinstance(asked.requests[rule].detection, Detection)
-    found = asked.requests[tuned]
+    assert isinstance(asked.requests[rule].source.detection, Detection)
+    found = asked.requests[tuned].source
     assert isinstance(found.detection, Tuned)
     assert found.stride_ms == 10
-    counting = counting_of(found.fitted)
-    made = [flow.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
+    detectors = {tuned: found.detector()}
+    made = [flow.measure(asked, case, detectors) for case in asked.cases[::2]]
     assert made[0].detected_ms is None
     assert made[1].detected_ms is not None
     with pytest.raises(InputError, match="must be one of network, paper, smoothing, "):
