@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import NotRequired, TypeAlias, TypedDict
 
 from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.live import LiveDetector, TimedDecision
@@ -26,7 +26,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.ui.detect_view import DetectView
 from sliplab.protocols import InputError
 from sliplab.protocols.hashing import hash_integer
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import DetectionTimes, Reaction, run_watched
 from sliplab.rigs.core.rig import Rig, StopRequested
@@ -34,6 +34,7 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
 
+BuildRig: TypeAlias = Callable[[RigFile, ShouldStop], Rig]
 RATE_HZ = 100
 FOREVER_S = 1e9
 TURN_S = 0.0005
@@ -112,7 +113,7 @@ def detect(
     out: Path | None = None,
     *,
     detector: StreamDetector | None = None,
-    build: Callable[[RigFile], Rig] = build_rig,
+    build: BuildRig = build_rig,
     show: bool = True,
 ) -> DetectSummary:
     """Run a detection to its end; return a summary, with ``interrupted`` if the user ended it.
@@ -140,10 +141,8 @@ def detect(
         write = done.enter_context(_lines(out))
         done.enter_context(held(request.rig))
         done.enter_context(stopping.signals())
-        rig = build(request.rig)
+        rig = build(request.rig, stopping.requested)
         done.callback(rig.close)
-        rig.should_stop = stopping.requested
-        rig.poll_s = min(rig.poll_s, request.poll_s)
         if isinstance(detector, NetworkDetector):
             detector.warm_up()
         live = LiveDetector(detector, width=rig.events.width, height=rig.events.height)

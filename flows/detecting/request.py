@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
@@ -36,6 +37,7 @@ class DetectRequest:
 
     Attributes:
         source: what detects.
+        rig: that reads its streams as often as requested.
         safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until the user ends it.
@@ -48,7 +50,6 @@ class DetectRequest:
     reflex: Reflex | None = None
     safe: Reflex | None = None
     seconds: float | None = None
-    poll_s: float = POLL_S
 
     @property
     def answer_s(self) -> float | None:
@@ -115,7 +116,6 @@ def make_detect_request(
     else:
         assert model is not None
         source = _network(model, stride_ms, detector, change)
-    requested = partial(DetectRequest, poll_s=poll_s)
     if protocol is None:
         for name, text in (("--trial", trial), ("--reflex", reflex)):
             if text is not None:
@@ -124,8 +124,8 @@ def make_detect_request(
         if seconds is None and file.in_virtual_time:
             right = f"is needed on {file.name}: its time is virtual and has no end"
             raise InputError("--seconds", "", None, right)
-        return requested(
-            rig=file,
+        return DetectRequest(
+            rig=_read_often(file, poll_s),
             source=source(None),
             seconds=seconds,
         )
@@ -137,14 +137,19 @@ def make_detect_request(
     if plan.protocol.collection.plate is not None and not file.has_plate:
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     chosen = choose_trial(plan, trial)
-    return requested(
-        rig=with_level(file, plan) if file.simulated else file,
+    return DetectRequest(
+        rig=_read_often(with_level(file, plan) if file.simulated else file, poll_s),
         source=source(plan.protocol.analysis),
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
         safe=None if reflex is None else make_safe_state(file, plan),
     )
+
+
+def _read_often(file: RigFile, poll_s: float) -> RigFile:
+    """Return a rig that reads its streams at least this often."""
+    return file.model_copy(update={"poll": min(file.poll, Decimal(str(poll_s)))})
 
 
 def _network(

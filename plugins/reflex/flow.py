@@ -9,7 +9,7 @@ safe state.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, StreamDetector
 from sliplab.analysis.detectors.registry import contents
 from sliplab.analysis.sweeps.runner import ResultFile, Sweep
-from sliplab.flows.detect import detect
+from sliplab.flows.detect import BuildRig, detect
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
 from sliplab.flows.detecting.sources import NamedSource, Source
 from sliplab.flows.running import console
@@ -30,7 +30,7 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
@@ -192,7 +192,7 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
 
 
 @contextmanager
-def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
+def _builder(file: RigFile) -> Iterator[BuildRig]:
     """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
     if file.in_virtual_time:
         yield build_rig
@@ -202,7 +202,7 @@ def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
     assert file.devices is not None
     stage = Loopback(file.scene, file.timing, file.devices, file.streams)
     try:
-        yield lambda rig: loopback_rig(rig, stage)
+        yield lambda rig, should_stop: loopback_rig(rig, stage, should_stop)
     finally:
         stage.close()
 
@@ -215,11 +215,11 @@ class Seen:
     truth: Truth | None = None
     course: PlateCourse | None = None
 
-    def by(self, build: Callable[[RigFile], Rig]) -> Callable[[RigFile], Rig]:
+    def by(self, build: BuildRig) -> BuildRig:
         """Return a function that builds the same rig, observed."""
 
-        def observed(file: RigFile) -> Rig:
-            rig = build(file)
+        def observed(file: RigFile, should_stop: ShouldStop) -> Rig:
+            rig = build(file, should_stop)
             take_step = rig.take_step
 
             def looking(index: int, step: Step, *rest: Any) -> Any:
@@ -242,7 +242,7 @@ def measure(
     asked: Request,
     case: ReflexCase,
     detectors: Mapping[str, StreamDetector],
-    build: Callable[[RigFile], Rig] = build_rig,
+    build: BuildRig = build_rig,
 ) -> ReflexTrial:
     """Run one trial.
 

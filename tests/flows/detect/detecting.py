@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,13 @@ from sliplab.analysis.detectors.network_detector import Counting
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
+from sliplab.flows.detect import BuildRig
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.flows.detecting.sources import NetworkSource
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
@@ -72,11 +72,11 @@ def ordered(model: Path, protocol: Path, **options: Any) -> DetectRequest:
     return make_detect_request(RIG, model, protocol=protocol, trial="", **options)
 
 
-def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:
+def keeping(rigs: list[Rig]) -> BuildRig:
     """Builds rigs and keeps them to be looked at."""
 
-    def build(file: RigFile) -> Rig:
-        rigs.append(build_rig(file))
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rigs.append(build_rig(file, should_stop))
         return rigs[-1]
 
     return build

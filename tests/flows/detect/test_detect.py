@@ -22,7 +22,7 @@ from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.detection import Detection
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
@@ -190,8 +190,8 @@ def test_a_reflex_that_fails_stops_the_arm(
             raise RigError("arm", "does not want to")
         return move(rig, step, *rest)
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         stop = rig.arm.stop
         monkeypatch.setattr(rig.arm, "stop", lambda: (stopped.append(1), stop())[1])
         return rig
@@ -223,8 +223,8 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     rigs: list[Rig] = []
     truth: list[dict[str, Any]] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         take_step, begun = rig.take_step, [0]
 
         def looking(index: int, step: Any, *rest: Any) -> Any:

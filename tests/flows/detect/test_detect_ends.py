@@ -15,6 +15,7 @@ from rich.console import Console
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import choose_trial, make_detect_request
 from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
@@ -57,8 +58,8 @@ def test_a_camera_whose_clock_falls_back_ends_it(
 ) -> None:
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         read, count = rig.events.read, iter(range(1000))
 
         def fallen() -> Any:

@@ -8,6 +8,7 @@ import pytest
 
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
@@ -33,8 +34,8 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     )
     with stage_of(order.rig) as stage:
 
-        def build(file: RigFile) -> Rig:
-            return loopback_rig(file, stage)
+        def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+            return loopback_rig(file, stage, should_stop)
 
         result = detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.arm_place()[2] < 0
@@ -73,8 +74,8 @@ def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path:
     )
     with stage_of(order.rig) as stage:
 
-        def build(file: RigFile) -> Rig:
-            return loopback_rig(file, stage)
+        def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+            return loopback_rig(file, stage, should_stop)
 
         reflex = detect(order, detector=scripted(order, slip_when_busy()), build=build)["reflex"]
         assert stage.arm_place()[2] < 0

@@ -18,6 +18,7 @@ from sliplab.flows.detect import detect
 from sliplab.flows.detecting.detector_process import NetworkLost, NetworkProcess
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.protocols import InputError
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import SafeState
 from sliplab.rigs.core.rig import Rig
@@ -64,8 +65,8 @@ def safe_state(
     """Run until the safe state, and return it and the rig."""
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         disturb(rig)
         return rig
 
@@ -213,8 +214,8 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
     """With a safe state the arm stays; without one it moves clear, as after any failure."""
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         read, pulses = rig.events.read, rig.events.read_pulses
 
         def lost() -> bool:
