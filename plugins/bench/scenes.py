@@ -18,7 +18,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.mock.fault_kinds import AnyFault
+from sliplab.rigs.core.faults import AnyFault
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import EventChunk

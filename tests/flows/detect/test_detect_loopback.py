@@ -84,7 +84,7 @@ def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path:
         assert reflex["closed_mm"] == pytest.approx(1.0, abs=0.34)
         assert reflex["depth_mm"] == pytest.approx(2.4 + reflex["closed_mm"], abs=0.05)
         assert not reflex["stalled"]
-        stage.inject("gripper", "silence")
+        stage.inject("gripper", "device_silent")
         with pytest.raises(RigError, match="gripper: no answer"):
             detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.at_rest()

@@ -16,6 +16,7 @@ from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
+from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.settings import AbbSettings
