@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sliplab.analysis.detectors.detector import (
+    NOTHING_US,
     Detector,
     DetectorError,
     Evidence,
@@ -40,7 +41,8 @@ class AtLevel(StreamDetector):
         """Begin a new scene. Raises DetectorError."""
         self._from_us = self._settled_us = self._window_us = at_us
         self._held = EventChunk.empty()
-        self._events, self._last_us = 0, None
+        self._events = 0
+        self._last_us: int | None = None
         try:
             self.detector.begin(*self._size)
         except Exception as error:  # another package's code: whatever it raises
@@ -49,7 +51,7 @@ class AtLevel(StreamDetector):
     @property
     def settled_us(self) -> int:
         """The moment up to which the detector has been given everything."""
-        return self._settled_us
+        return self._settled_us if self._settled_us > self._from_us else NOTHING_US
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `StreamDetector`. Raises DetectorError."""

@@ -22,6 +22,10 @@ NO_LABEL = -1
 """Label of a decision without a class."""
 
 
+NOTHING_US = -(1 << 62)
+"""Time before all events."""
+
+
 class DetectorError(ValueError):
     """A detector broke the rules of its interface, or failed."""
 
@@ -184,7 +188,7 @@ class StreamDetector(Detector):
     @property
     @abstractmethod
     def settled_us(self) -> int:
-        """Time before which events no longer count."""
+        """Time before which events no longer count; `NOTHING_US` before anything is settled."""
 
     @abstractmethod
     def resume(self, at_us: int) -> None:

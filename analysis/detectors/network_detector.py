@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detector import Evidence, JudgedWindow, StreamDetector
+from sliplab.analysis.detectors.detector import NOTHING_US, Evidence, JudgedWindow, StreamDetector
 from sliplab.analysis.detectors.detectors import Predictions, Tuned
 from sliplab.analysis.detectors.smoothing_rule import paper_rule
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT
@@ -107,10 +107,6 @@ def counting_of(fitted: Fitted) -> Counting:
     fitted.check_slip("the model", "detection")
     fast = fitted.engine
     return lambda x: fast.counts(x, 1)
-
-
-NOTHING_US = -(1 << 62)
-"""Time before all events: no window has been evaluated."""
 
 
 @dataclass

@@ -136,14 +136,14 @@ def test_a_safe_state_has_it_in_a_process_of_its_own(protocol: Path, tmp_path: P
 
 def test_what_cannot_be_had_is_said(tmp_path: Path) -> None:
     for name, level, said in (
-        ("ours", 1.0, "--model = null: is needed: 'ours' is trained on the trials of a store"),
-        ("rate", None, "--level = null: is needed, or a store as --model"),
+        ("ours", 1.0, "--model: is needed: 'ours' is trained on the trials of a store"),
+        ("rate", None, "--level: is needed, or a store as --model"),
     ):
         with pytest.raises(InputError, match=said):
             named_source(name, level, None)
     asked = ("detect", "--rig", RIG, "--seconds", "1", "--json")
     for options, said in (
-        ((), "--model = null: is needed"),
+        ((), "--model: is needed"),
         (("--detector", "rat", "--level", "1"), "is a detector of a store"),
         (("--detector", "rate", "--level", "1", "--margin", "2"), "is of the rule"),
     ):
