@@ -35,7 +35,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.mock.fault_kinds import MarkerOccluded
+from sliplab.rigs.core.faults import MarkerOccluded
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import Chunk, FrameChunk, Json
 

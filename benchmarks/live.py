@@ -18,6 +18,7 @@ from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
 from benchmarks.slides import slide_events
 from sliplab.analysis.detectors.live import LiveDetector
+from sliplab.analysis.detectors.network_detector import NetworkDetector
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.windows import Windows
@@ -34,8 +35,9 @@ def measure(seconds: float = HOUR_S) -> Figures:
     edges = np.searchsorted(events.t_us, np.arange(first, last + PACKET_US, PACKET_US))
     parts = [slice(int(a), int(b)) for a, b in pairwise(edges) if b > a]
     engine = SpikeEngine(gridded(Windows(), SEED), Windows().cells)
-    live = LiveDetector(lambda x: engine.counts(x, 1), Windows(), Detection())
-    live.warm_up()
+    network = NetworkDetector(lambda x: engine.counts(x, 1), Windows(), Detection())
+    network.warm_up()
+    live = LiveDetector(network)
     taken = array("d")  # a list would grow by more than the detector
     memory: list[float] = []
     windows = 0

@@ -49,7 +49,7 @@ from sliplab.plugins.twin.posterior import Bank, FittedBank, ParameterPosterior,
 from sliplab.plugins.twin.statistics import SlideStatistics, of_names, statistics
 from sliplab.plugins.twin.worlds import DrawnWorld, Prior, Slides
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock import fault_settings as faults
+from sliplab.rigs.core import faults
 from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs

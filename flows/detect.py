@@ -1,4 +1,4 @@
-"""`sliplab detect`: a trained network on a rig's running event stream.
+"""`sliplab detect`: a detector on a rig's running event stream.
 
 Without a protocol the arm does not move. With one, a trial's motion is executed (nothing is
 stored), and a reflex may interrupt it. However it ends, the arm is stopped first.
@@ -11,26 +11,22 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import NotRequired, TypeAlias, TypedDict
 
-from sliplab.analysis.detectors.live import (
-    ClockFellBack,
-    Counting,
-    LiveDetector,
-    TimedDecision,
-    counting_of,
-)
+from sliplab.analysis.detectors.detector import StreamDetector
+from sliplab.analysis.detectors.live import LiveDetector, TimedDecision
+from sliplab.analysis.detectors.network_detector import NetworkDetector
 from sliplab.analysis.networks import training
-from sliplab.flows.detecting.network_process import PATIENT_S, NetworkLost, NetworkProcess
 from sliplab.flows.detecting.request import DetectRequest
-from sliplab.flows.detecting.sink import DetectNumbers, DetectSink
+from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
+from sliplab.flows.detecting.sources import NetworkSource
 from sliplab.flows.running import stopping
 from sliplab.flows.ui.detect_view import DetectView
 from sliplab.protocols import InputError
 from sliplab.protocols.hashing import hash_integer
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import DetectionTimes, Reaction, run_watched
 from sliplab.rigs.core.rig import Rig, StopRequested
@@ -38,6 +34,7 @@ from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
 
+BuildRig: TypeAlias = Callable[[RigFile, ShouldStop], Rig]
 RATE_HZ = 100
 FOREVER_S = 1e9
 TURN_S = 0.0005
@@ -93,6 +90,8 @@ class DetectSummary(DetectNumbers):
     """Summary of a detection.
 
     Attributes:
+        model: the network; None where another detector ran.
+        detector: the other detector's name.
         trial, protocol: of the motion; None where the arm did not move.
         virtual_time: the rig's clock is not the real one.
         interrupted: the user ended it.
@@ -100,7 +99,8 @@ class DetectSummary(DetectNumbers):
 
     simulated: bool
     rig: str
-    model: ModelPath
+    model: ModelPath | None
+    detector: str | None
     trial: str | None
     protocol: str | None
     virtual_time: bool
@@ -112,16 +112,16 @@ def detect(
     request: DetectRequest,
     out: Path | None = None,
     *,
-    counting: Counting | None = None,
-    build: Callable[[RigFile], Rig] = build_rig,
+    detector: StreamDetector | None = None,
+    build: BuildRig = build_rig,
     show: bool = True,
 ) -> DetectSummary:
     """Run a detection to its end; return a summary, with ``interrupted`` if the user ended it.
 
     Args:
         out: a file of JSON lines, one a decision, that is written while it runs.
-        counting: the network; by default the model's with the event-driven kernels in one thread,
-            in a separate process where the request has a safe state.
+        detector: that runs, in this process; by default the request's, in a separate process where
+            the request has a safe state.
         build: makes the rig.
         show: show decisions on the terminal.
 
@@ -133,19 +133,20 @@ def detect(
     """
     training.limit_threads(1)
     with ExitStack() as done:
+        done.enter_context(_failures())
         done.enter_context(_short_turns())
-        counting = counting or done.enter_context(_counting(request))
+        if detector is None:
+            centre_px = request.rig.calibration.centre_px
+            detector = done.enter_context(request.source.running(request.answer_s, centre_px))
         write = done.enter_context(_lines(out))
         done.enter_context(held(request.rig))
         done.enter_context(stopping.signals())
-        rig = build(request.rig)
+        rig = build(request.rig, stopping.requested)
         done.callback(rig.close)
-        rig.should_stop = stopping.requested
-        rig.poll_s = min(rig.poll_s, request.poll_s)
-        detector = _detector(request, rig, counting)
-        fitted = request.fitted
-        most = fitted.windows.steps * fitted.network.outputs_per_class
-        view = DetectView(_title(request), most) if show else None
+        if isinstance(detector, NetworkDetector):
+            detector.warm_up()
+        live = LiveDetector(detector, width=rig.events.width, height=rig.events.height)
+        view = DetectView(_title(request), request.source.most) if show else None
         if view is not None:
             done.enter_context(view)
 
@@ -155,34 +156,14 @@ def detect(
                 view.on_decision(timed)
 
         poll = (lambda: None) if view is None else view.poll
-        sink = DetectSink(detector, rig.clock, on_decision, poll, request.timeouts)
+        sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts)
         rig.connect()
         reaction, interrupted = None, False
-        try:
-            if request.trial is None:
-                interrupted = _listen(request, rig, sink)
-            else:
-                reaction = _move(request, rig, sink)
-        except ClockFellBack as error:
-            raise RigError("event camera", str(error)) from None
-        except NetworkLost as error:
-            raise RigError("network", str(error)) from None
+        if request.trial is None:
+            interrupted = _listen(request, rig, sink)
+        else:
+            reaction = _move(request, rig, sink)
     return _summary(request, sink, reaction, interrupted)
-
-
-def _detector(request: DetectRequest, rig: Rig, counting: Counting) -> LiveDetector:
-    windows = request.fitted.windows
-    detector = LiveDetector(
-        counting,
-        windows,
-        request.detection,
-        width=rig.events.width,
-        height=rig.events.height,
-        centre_px=request.rig.calibration.centre_px,
-        stride_us=None if request.stride_ms is None else round(request.stride_ms * 1000),
-    )
-    detector.warm_up()
-    return detector
 
 
 def _listen(request: DetectRequest, rig: Rig, sink: DetectSink) -> bool:
@@ -240,19 +221,12 @@ def _short_turns() -> Iterator[None]:
 
 
 @contextmanager
-def _counting(request: DetectRequest) -> Iterator[Counting]:
-    """Yield the model's network, in a separate process if the request has a safe state."""
-    limit_ns = None if request.timeouts is None else request.timeouts.decision_ns
-    if limit_ns is None:
-        yield counting_of(request.fitted)
-        return
-    answer_s = PATIENT_S if request.rig.in_virtual_time else limit_ns / 1e9
+def _failures() -> Iterator[None]:
+    """Raise RigError where the detector fails."""
     try:
-        network = NetworkProcess(request.model, answer_s)
-    except NetworkLost as error:
-        raise RigError("network", str(error)) from None
-    with closing(network):
-        yield network
+        yield
+    except tuple(FAILURES) as error:
+        raise RigError(failed_device(error), str(error)) from None
 
 
 @contextmanager
@@ -276,7 +250,7 @@ def _title(request: DetectRequest) -> str:
     what = "listening" if request.trial is None else f"trial {request.trial.id}"
     reflex = f", reflex {request.reflex.kind}" if request.reflex else ""
     mode = f"{request.simulated}{what}{reflex}"
-    return f"detect on {request.rig.name} ({mode}), model {request.model.name}"
+    return f"detect on {request.rig.name} ({mode}), {request.source.title}"
 
 
 def _reaction_ms(reaction: Reaction, seen: DetectionTimes) -> ReactionMs:
@@ -311,10 +285,14 @@ def _summary(
                 "stalled": reaction.stalled,
                 "reaction_ms": _reaction_ms(reaction, seen),
             }
+    source, model = request.source, None
+    if isinstance(source, NetworkSource):
+        model = ModelPath(file=str(source.model), sha256=source.sha256)
     return {
         "simulated": request.rig.simulated,
         "rig": request.rig.name,
-        "model": {"file": str(request.model), "sha256": request.model_sha256},
+        "model": model,
+        "detector": None if isinstance(source, NetworkSource) else source.name,
         "trial": None if request.trial is None else request.trial.id,
         "protocol": None if request.plan is None else request.plan.protocol.name,
         "virtual_time": request.rig.in_virtual_time,

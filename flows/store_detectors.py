@@ -9,6 +9,7 @@ from pathlib import Path
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
+from sliplab.analysis.detectors.registry import is_known, known
 from sliplab.analysis.detectors.smoothing_rule import paper_rule
 from sliplab.analysis.evaluation.detectors import detector_work
 from sliplab.analysis.labels.reviewed import StoreLabels
@@ -20,6 +21,7 @@ from sliplab.analysis.networks.models import (
     training_settings,
     wanted_models,
 )
+from sliplab.flows.detecting.sources import NamedSource, named_source
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
 from sliplab.protocols.shown import one_of
@@ -75,37 +77,44 @@ def _others(store: Store, campaigns: list[Collected]) -> Iterator[ModelOnDisk]:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A network, and what reads its spikes.
+    """A network and what reads its spikes, or another detector.
 
     Attributes:
+        model: None of a detector by its name.
         detector: None for the rule of the protocol that is run.
         stride_ms: from one window's start to the next one's; None for the window's length.
     """
 
-    model: Path
-    detector: Tuned | None = None
+    model: Path | None
+    detector: Tuned | NamedSource | None = None
     stride_ms: int | None = None
 
 
-def detectors_of(place: Path, names: Sequence[str] = ()) -> dict[str, Chosen]:
+def detectors_of(
+    place: Path | None, names: Sequence[str] = (), level: float | None = None
+) -> dict[str, Chosen]:
     """Return detectors by their names: a model with the rule, or all that a store has.
 
     Args:
-        names: of the requested detectors; by default all.
+        place: a model file, or a store; None for a detector by its name that needs neither.
+        names: of the requested detectors, also such as `sliplab bench` judges; by default all of
+            the model or store.
+        level: of detectors by their names; None: the store's validation trials set it.
 
     Raises:
         InputError: there is none.
         StoreError: a network of the store is missing or stale.
     """
-    found = _of_store(place, names) if place.is_dir() else {place.stem: Chosen(place)}
-    unknown = next((name for name in names if name not in found), None)
-    if unknown is not None:
-        raise InputError(
-            "--detector",
-            "",
-            unknown,
-            one_of(unknown, found),
-        )
+    store = place if place is not None and place.is_dir() else None
+    found: dict[str, Chosen] = {}
+    if place is not None:
+        found = {place.stem: Chosen(place)} if store is None else _of_store(store, names)
+    for name in names:
+        if name in found:
+            continue
+        if not is_known(name):
+            raise InputError("--detector", "", name, one_of(name, [*found, *known()]))
+        found[name] = Chosen(None, named_source(name, level, store))
     return {name: found[name] for name in names or found}
 
 
@@ -119,7 +128,7 @@ def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
     found = {NETWORK: Chosen(choose_model(wanted_models(store, campaigns)).path)}
     for other in _others(store, campaigns):
         found[str(other.settings.preset)] = Chosen(other.path)
-    if names and set(names) <= found.keys():
+    if names and all(name in found or is_known(name) for name in names):
         return found
     for network in store_detectors(store, campaigns):
         for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule

@@ -36,8 +36,8 @@ class Plugin:
             page. One of a group, such as ``calibrate``, has the name ``GROUP NAME``.
         documents: by kind, further models of the JSON documents that it writes
             (`storage.schema.document.Document`), each with the title of its schema.
-        detectors: detectors of slip that the bench judges (`plugins.bench.interface.Detector`), by
-            name: classes or functions without arguments.
+        detectors: detectors of slip (`analysis.detectors.detector.Detector`), by name: classes or
+            functions without arguments.
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only
             drivers names them in the group of entry points `sliplab.drivers` instead.
         sections: sections of the report by name (`analysis.report.plugin_sections.ReportSection`).

@@ -139,7 +139,7 @@ def driven_rig(
             events = devices.event_camera_driver.build(devices.event_camera)
             undo.callback(events.close)
         settings = calibrated_arm(file, devices)
-        arm = devices.arm_driver.build(settings)
+        arm = devices.arm_driver.builder(_arm_measures(file, devices))(settings)
         further = []
         for name, stream in file.streams.items():
             further.append(driven_stream(name, stream, arm, taught_frame(file)))
@@ -170,6 +170,12 @@ def driven_rig(
         )
         undo.pop_all()
     return rig
+
+
+def _arm_measures(file: RigFile, devices: DeviceSettings) -> bool:
+    """Return whether a force sensor of the rig reads the arm's own wrench."""
+    drivers = [devices.force_sensor_driver, *(stream.driver for stream in file.streams.values())]
+    return any(isinstance(it, ForceSensorDriver) and it.of_arm for it in drivers)
 
 
 def _frame_camera(file: RigFile, devices: DeviceSettings) -> FrameCamera:

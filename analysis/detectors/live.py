@@ -1,36 +1,28 @@
-"""The detector on a running stream: events in as they come, one decision out for each window.
+"""A detector on a running stream: events in as they come, decisions out.
 
-Events are counted into the windows that are open when they arrive, so no past event is stored or
-binned again, and a window is evaluated by the functions that score a stored trial: the same
-events give the same windows, counts and decisions. What a stream does that a file does not
+The detector is the one that scores a stored trial. What a stream does that a file does not
 (silence, events out of order, events too late, a clock that leaps) has one outcome each:
 
 - A window ends when an event at or after its end has come, or when `advance` says that the
   camera's clock is past it; so a quiet scene is evaluated too.
 - Events out of order count where they belong while their window is open.
 - An event of an already evaluated window is dropped and counted as late; nothing is revised.
-- Time that leaps ahead by more than `gap_us` is a gap: the open windows are given up, the sliding
-  window restarts, and the gap is counted.
+- Time that leaps ahead by more than `gap_us` is a gap: the detector resumes after it (a network's
+  open windows are given up, and its sliding window restarts), and the gap is counted.
 - Time that falls back by more than `back_us` is another clock: `ClockFellBack`.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from dataclasses import dataclass, field, replace
+from typing import TypedDict
 
 import numpy as np
-import numpy.typing as npt
 
-from sliplab.analysis.detectors.detectors import Predictions, Tuned
-from sliplab.analysis.detectors.smoothing_rule import paper_rule
+from sliplab.analysis.detectors.detector import DetectorError, StreamDetector
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT
-from sliplab.analysis.networks.training import Fitted
-from sliplab.analysis.windows.windows import bin_events
-from sliplab.protocols.detection import Detection
-from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
 UNDECIDED = "undecided"
@@ -42,8 +34,10 @@ class LiveDecision:
 
     Attributes:
         number: of the window, from 0; gaps leave numbers out.
-        counts: output spikes in the order of `analysis.metrics.classification.CLASSES`.
-        smoothed, valid_class, onset: as `RuleStep`.
+        value: evidence for slip; -inf where there is none yet.
+        counts, smoothed: as `JudgedWindow`.
+        valid_class: the decided class; -1 where none is valid.
+        onset: ``incipient`` or ``gross`` where it is decided for the first time, gross after that.
         events: events of the window, all over the sensor and of both polarities.
         last_event_us: the latest of them; None in a window without events.
         by_event: an event ended the window, and not the clock alone.
@@ -53,8 +47,9 @@ class LiveDecision:
     number: int
     start_us: int
     end_us: int
-    counts: tuple[int, int, int]
-    smoothed: tuple[float, float, float]
+    value: float
+    counts: tuple[int, int, int] | None
+    smoothed: tuple[float, float, float] | None
     valid_class: int
     onset: str | None
     events: int
@@ -73,8 +68,9 @@ class DecisionJson(TypedDict):
     phase: str
     state: str
     onset: str | None
-    counts: list[int]
-    smoothed: list[float]
+    value: float | None
+    counts: list[int] | None
+    smoothed: list[float] | None
     events: int
     by_event: bool
     latency_ms: float | None
@@ -115,8 +111,9 @@ class TimedDecision:
             "phase": self.phase,
             "state": self.state,
             "onset": made.onset,
-            "counts": list(made.counts),
-            "smoothed": list(made.smoothed),
+            "value": made.value if math.isfinite(made.value) else None,
+            "counts": None if made.counts is None else list(made.counts),
+            "smoothed": None if made.smoothed is None else list(made.smoothed),
             "events": made.events,
             "by_event": made.by_event,
             "latency_ms": self.latency_ms,
@@ -141,75 +138,6 @@ class StreamFaults:
     longest_gap_us: int = 0
 
 
-@dataclass(frozen=True)
-class RuleStep:
-    """Answer of the rule after one more window.
-
-    Attributes:
-        smoothed: trailing mean counts in the order of `metrics.classification.CLASSES`, over the
-            windows there are.
-        valid_class: the detected class; -1 where none is valid.
-        onset: ``incipient`` or ``gross`` where this window is the first such detection.
-    """
-
-    smoothed: tuple[float, float, float]
-    valid_class: int
-    onset: str | None
-
-
-class RunningRule:
-    """A rule at its levels, window by window: the decisions of the whole trial, to the bit.
-
-    After an interruption evidence is reset; onsets stay.
-
-    Args:
-        detection: the paper's rule by its settings, or another rule with its levels.
-    """
-
-    def __init__(self, detection: Detection | Tuned) -> None:
-        self._tuned = paper_rule(detection) if isinstance(detection, Detection) else detection
-        self._windows, self._incipient, self._gross = 0, False, False
-        self._state: Any = self._tuned.detector.begin()
-
-    @property
-    def span(self) -> int:
-        """Fewest windows that a decision is based on."""
-        return self._tuned.detector.span
-
-    def step(self, counts: npt.NDArray[np.integer[Any]], events: int = 0) -> RuleStep:
-        """Take the output spikes, integer (3,), and events of the window after the last one.
-
-        Raises:
-            ValueError: another shape or type.
-        """
-        row = np.asarray(counts)
-        if row.shape != (len(CLASSES),) or not np.issubdtype(row.dtype, np.integer):
-            raise ValueError(f"counts are {row.dtype} {row.shape}; expected integers (3,)")
-        self._windows += 1
-        window = Predictions(
-            row[None].astype(np.int64), np.array([events]), np.array([self._windows])
-        )
-        rule, levels = self._tuned.detector, self._tuned.levels
-        self._state, evidence = rule.push(self._state, window)
-        onset = None
-        if not self._incipient:
-            if evidence.incipient[0] > levels.incipient:
-                self._incipient, onset = True, CLASSES[INCIPIENT]
-                self._state = rule.detected(self._state)
-        elif not self._gross and evidence.gross_after(-1)[0] > levels.gross:
-            self._gross, onset = True, CLASSES[GROSS]
-        a, b, c = evidence.smoothed[0].tolist()
-        return RuleStep((a, b, c), int(self._tuned.classes(evidence, self._gross)[0]), onset)
-
-    def interrupt(self) -> None:
-        """Forget the windows, as the next one does not follow them."""
-        rule = self._tuned.detector
-        self._state = rule.detected(rule.begin()) if self._incipient else rule.begin()
-
-
-Counting = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.int64]]
-"""Output spikes int64 (1, 3) of one window, uint8 (1, steps, channels, cells, cells)."""
-
 GAP_US = 10_000_000
 BACK_US = 1_000_000
 
@@ -218,79 +146,39 @@ class ClockFellBack(ValueError):
     """The camera's clock fell back, so that earlier times cannot be compared."""
 
 
-@dataclass
-class _Open:
-    """A window that is still open."""
-
-    start_us: int
-    x: npt.NDArray[np.uint8]
-    events: int = 0
-    last_us: int | None = None
-
-
-def counting_of(fitted: Fitted) -> Counting:
-    """The network's spike counts by the event-driven kernels, in the calling thread alone.
-
-    Raises:
-        InputError: its classes are not those of slip.
-    """
-    fitted.check_slip("the model", "detection")
-    fast = fitted.engine
-    return lambda x: fast.counts(x, 1)
-
-
 class LiveDetector:
-    """Windows, counts and decisions of one stream.
+    """The decisions of a detector on one stream.
 
     Args:
-        counts: the network.
-        windows: shape of a sample.
-        detection: sliding window and margin of the paper's rule, or another detector.
+        detector: begins with the first event or time.
         width, height: the sensor's pixels.
-        centre_px: middle of the crop, as for `analysis.windows.windows.bin_events`.
-        stride_us: from one window's start to the next one's; the window's length by default.
-        starts: start of each window by its number, strictly increasing, instead of an even grid
-            that begins with the first event or time.
+        origin_us: when it begins, instead.
         gap_us, back_us: see the module.
 
     Raises:
-        ValueError: a crop larger than the sensor, or a stride, gap or step back that is not
+        ValueError: a sensor that the detector does not work with, or a gap or step back that is not
             positive.
     """
 
     def __init__(
         self,
-        counts: Counting,
-        windows: Windows,
-        detection: Detection | Tuned,
+        detector: StreamDetector,
         *,
         width: int = 640,
         height: int = 480,
-        centre_px: tuple[float, float] | None = None,
-        stride_us: int | None = None,
-        starts: Callable[[int], int] | None = None,
+        origin_us: int | None = None,
         gap_us: int = GAP_US,
         back_us: int = BACK_US,
     ) -> None:
-        self._counts, self._windows = counts, windows
-        self._rule = RunningRule(detection)
-        self._geometry = (width, height, centre_px)
-        self._length_us = windows.length_ms * 1000
-        self._stride_us = self._length_us if stride_us is None else stride_us
-        if min(self._stride_us, gap_us, back_us) <= 0:
-            raise ValueError("stride_us, gap_us and back_us must be positive")
-        self._starts = starts
+        if min(gap_us, back_us) <= 0:
+            raise ValueError("gap_us and back_us must be positive")
+        self._detector, self.origin_us = detector, origin_us
+        """Moment at which the detector began; None before the first event or time."""
         self._gap_us, self._back_us = gap_us, back_us
-        self._open: dict[int, _Open] = {}
-        self._next = 0
         self._now_us: int | None = None
-        self._judged_us: int | None = None
+        self._found: list[int] = []
         self.losses = StreamFaults()
-        self._bin(_NO_EVENTS, 0)  # raises where the crop does not fit
-
-    def warm_up(self) -> None:
-        """Load and compile everything in advance, so that the first window need not wait."""
-        self._counts(self._empty())
+        detector.begin(width, height)
 
     @property
     def now_us(self) -> int | None:
@@ -298,26 +186,17 @@ class LiveDetector:
         return self._now_us
 
     @property
-    def origin_us(self) -> int | None:
-        """Start of the first window; None before the first event or time."""
-        return None if self._starts is None else self._starts(0)
-
-    @property
     def span_us(self) -> int:
-        """Span of the windows that a decision rests on."""
-        return self._length_us + (self._rule.span - 1) * self._stride_us
-
-    @property
-    def open_windows(self) -> int:
-        """Number of open windows: the detector's memory does not grow with time."""
-        return len(self._open)
+        """Span of the events that a decision rests on; 0 where it is not known."""
+        return self._detector.span_us
 
     def push(self, chunk: EventChunk) -> list[LiveDecision]:
-        """Take events; give the decisions of the windows that they end, in order.
+        """Take events; give the decisions that they bring, in order.
 
         Raises:
             ClockFellBack: see the module.
             ValueError: an event outside the sensor.
+            DetectorError: the detector failed, or its evidence is not a number.
         """
         if not len(chunk):
             return []
@@ -325,7 +204,11 @@ class LiveDetector:
         edges = np.flatnonzero(np.diff(chunk.t_us) > self._gap_us) + 1
         made = []
         for part in np.split(np.arange(len(chunk)), edges) if len(edges) else [slice(None)]:
-            made += self._push(chunk[part])
+            events = chunk[part]
+            self._come_to(int(events.t_us[0]))
+            last_us = int(events.t_us[-1])
+            self._now_us = last_us if self._now_us is None else max(self._now_us, last_us)
+            made += self._decisions(events, by_event=True)
         return made
 
     def advance(self, to_us: int) -> list[LiveDecision]:
@@ -337,12 +220,7 @@ class LiveDetector:
             return []
         self._come_to(to_us)
         self._now_us = to_us
-        made = []
-        while self._start(self._next) + self._length_us <= to_us:
-            made.append(self._judge(self._next, by_event=False))
-        return made
-
-    # -- events ------------------------------------------------------------------------------
+        return self._decisions(EventChunk.empty(), by_event=False)
 
     def _ordered(self, chunk: EventChunk) -> EventChunk:
         """Return the chunk sorted by time, and count events that arrived out of order."""
@@ -358,108 +236,59 @@ class LiveDetector:
         if disordered:
             chunk = chunk[np.argsort(t_us, kind="stable")]
         self.losses.disordered += disordered
-        if self._judged_us is not None:
-            self.losses.late += int(np.searchsorted(chunk.t_us, self._judged_us))
+        if self.origin_us is not None:
+            settled_us = self.origin_us + self._detector.settled_us
+            self.losses.late += int(np.searchsorted(chunk.t_us, settled_us))
         return chunk
 
-    def _push(self, chunk: EventChunk) -> list[LiveDecision]:
-        """Events in order and without a gap among them."""
-        self._come_to(int(chunk.t_us[0]))
-        last_us = int(chunk.t_us[-1])
-        self._now_us = last_us if self._now_us is None else max(self._now_us, last_us)
-        made = []
-        number = self._next
-        while (start_us := self._start(number)) <= last_us:
-            self._fill(number, start_us, chunk)
-            if start_us + self._length_us <= last_us:
-                made.append(self._judge(number, by_event=True))
-            number += 1
-        return made
-
-    def _fill(self, number: int, start_us: int, chunk: EventChunk) -> None:
-        """Count the events of one window, which is opened for them."""
-        bounds = np.searchsorted(chunk.t_us, [start_us, start_us + self._length_us])
-        begin, end = bounds.tolist()
-        window = self._opened(number, start_us)
-        if begin == end:
-            return
-        more = self._bin(chunk[begin:end], start_us)
-        # 255 stays 255, as if all had been counted at once
-        window.x += np.minimum(more, 255 - window.x)
-        window.events += end - begin
-        last_us = int(chunk.t_us[end - 1])
-        window.last_us = last_us if window.last_us is None else max(window.last_us, last_us)
-
-    def _bin(self, chunk: EventChunk, start_us: int) -> npt.NDArray[np.uint8]:
-        starts = np.array([start_us], np.int64)
-        return bin_events(chunk, starts, self._windows, *self._geometry)
-
-    # -- windows -----------------------------------------------------------------------------
-
-    def _start(self, number: int) -> int:
-        assert self._starts is not None
-        return self._starts(number)
-
-    def _opened(self, number: int, start_us: int) -> _Open:
-        if number not in self._open:
-            self._open[number] = _Open(start_us, self._empty())
-        return self._open[number]
-
-    def _empty(self) -> npt.NDArray[np.uint8]:
-        w = self._windows
-        return np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8)
-
-    def _judge(self, number: int, *, by_event: bool) -> LiveDecision:
-        """Close the first window that is not evaluated, `number`, and return its decision."""
-        start_us = self._start(number)
-        window = self._opened(number, start_us)
-        del self._open[number]
-        counts = self._counts(window.x)[0]
-        stated = self._rule.step(counts, window.events)
-        self._next = number + 1
-        self._judged_us = start_us + self._length_us
-        a, b, c = counts.tolist()
-        return LiveDecision(
-            number=number,
-            start_us=start_us,
-            end_us=self._judged_us,
-            counts=(a, b, c),
-            smoothed=stated.smoothed,
-            valid_class=stated.valid_class,
-            onset=stated.onset,
-            events=window.events,
-            last_event_us=window.last_us,
-            by_event=by_event,
-            decided_ns=time.monotonic_ns(),
-        )
-
     def _come_to(self, t_us: int) -> None:
-        """Advance to `t_us`: the first time starts the grid, and gaps are handled."""
-        if self._starts is None:
-            stride_us = self._stride_us
-            self._starts = lambda number: t_us + number * stride_us
+        """Advance to `t_us`: the detector begins with the first time, and gaps are handled."""
+        if self.origin_us is None:
+            self.origin_us = t_us
         if self._now_us is None or t_us - self._now_us <= self._gap_us:
             return
         self.losses.gaps += 1
         self.losses.longest_gap_us = max(self.losses.longest_gap_us, t_us - self._now_us)
-        self._open.clear()
-        self._rule.interrupt()
-        self._next = self._first_from(t_us)
-        self._judged_us = self._start(self._next)
+        self._detector.resume(t_us - self.origin_us)
 
-    def _first_from(self, t_us: int) -> int:
-        """Number of the first window, not judged yet, that begins at `t_us` or later."""
-        low, step = self._next, 1
-        while self._start(low + step) < t_us:
-            step *= 2
-        high = low + step
-        while low < high:
-            middle = (low + high) // 2
-            low, high = (low, middle) if self._start(middle) >= t_us else (middle + 1, high)
-        return low
+    def _decisions(self, events: EventChunk, *, by_event: bool) -> list[LiveDecision]:
+        """Push events, complete up to now, and return what the detector says."""
+        assert self._now_us is not None
+        assert self.origin_us is not None
+        origin_us = self.origin_us
+        moved = replace(events, t_us=events.t_us - origin_us)
+        evidence = self._detector.push(moved, self._now_us - origin_us)
+        decided_ns = time.monotonic_ns()
+        if np.isnan(evidence.value).any():
+            raise DetectorError("evidence is no number")
+        made = []
+        for k, window in enumerate(evidence.windows):
+            label, last_us = int(evidence.label[k]), window.last_event_us
+            made.append(
+                LiveDecision(
+                    number=window.number,
+                    start_us=origin_us + window.start_us,
+                    end_us=origin_us + int(evidence.t_us[k]),
+                    value=float(evidence.value[k]),
+                    counts=window.counts,
+                    smoothed=window.smoothed,
+                    valid_class=label,
+                    onset=self._onset(label),
+                    events=window.events,
+                    last_event_us=None if last_us is None else origin_us + last_us,
+                    by_event=by_event,
+                    decided_ns=decided_ns,
+                )
+            )
+        return made
 
-
-_NO_EVENTS = EventChunk.empty()
+    def _onset(self, label: int) -> str | None:
+        """Return the name of a class that is decided for the first time: gross after incipient."""
+        following = (INCIPIENT, GROSS)[len(self._found) :]
+        if not following or label != following[0]:
+            return None
+        self._found.append(label)
+        return CLASSES[label]
 
 
 SPAN_NS = 5_000_000_000

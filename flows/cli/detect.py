@@ -29,17 +29,25 @@ app = typer.Typer()
 def detect(
     rig: RigOption,
     model: Annotated[
-        Path,
+        Path | None,
         typer.Option("--model", help="A trained network, models/seed0.pt, or a store with one."),
-    ],
+    ] = None,
     detector: Annotated[
         str,
         typer.Option(
             "--detector",
             help="Of a store: network or paper (with the rule), or a compared one, such as 'hmm "
-            "counts', at the level that validation trials set.",
+            "counts', at the level that validation trials set; or any of `sliplab bench`.",
         ),
     ] = "network",
+    level: Annotated[
+        float | None,
+        typer.Option(
+            "--level",
+            help="Evidence above which a detector of `sliplab bench` says slip; default: set by "
+            "the store's validation trials.",
+        ),
+    ] = None,
     protocol: Annotated[
         Path | None,
         typer.Option("--protocol", help="Run a trial of this protocol; default: only listen."),
@@ -88,7 +96,7 @@ def detect(
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detecting.request import make_detect_request
 
-    chosen = _chosen(model, detector, stride, rule)
+    chosen = _chosen(model, detector, level, stride, rule)
     order = make_detect_request(
         rig,
         chosen.model,
@@ -113,27 +121,42 @@ def detect(
         raise typer.Exit(exit_codes.INTERRUPTED)
 
 
-def _chosen(model: Path, detector: str, stride: float | None, rule: RuleOptions) -> Chosen:
-    """Return a detector of a store, or a network with the rule.
+def _chosen(
+    model: Path | None,
+    detector: str,
+    level: float | None,
+    stride: float | None,
+    rule: RuleOptions,
+) -> Chosen:
+    """Return a network with the rule, a detector of a store, or one by its name.
 
     Raises:
         InputError: there is no such detector, or it has no such option.
         StoreError: a network of the store is missing or stale.
     """
-    if model.is_dir():
+    store = model if model is not None and model.is_dir() else None
+    if store is not None:
         from sliplab.flows.steps import prepare_store
         from sliplab.storage.remote.mirror import open_store
 
-        open_store(model)
-        prepare_store(model)  # before anything imports Prefect
+        open_store(store)
+        prepare_store(store)  # before anything imports Prefect
+    from sliplab.analysis.detectors.registry import is_known
     from sliplab.flows.store_detectors import Chosen, detectors_of
 
-    if not model.is_dir():
+    if detector == "network" and model is None:
+        right = "is needed: a trained network, or a store; or name a --detector with a --level"
+        raise InputError("--model", "", None, right)
+    if store is None and not is_known(detector):
         if detector != "network":
             right = "is a detector of a store: name the store with --model"
             raise InputError("--detector", "", detector, right)
-        return Chosen(model)
-    found = detectors_of(model, [detector])[detector]
+        found = Chosen(model)
+    else:
+        found = detectors_of(store, [detector], level)[detector]
+    if level is not None and found.model is not None:
+        right = f"is of detectors of `sliplab bench`; '{detector}' has its own"
+        raise InputError("--level", "", level, right)
     if found.detector is not None:
         given = (("--stride", stride), ("--margin", rule.margin), ("--smoothing", rule.smoothing))
         for name, value in given:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
+from sliplab.flows.detecting.detector_process import PATIENT_S
 from sliplab.flows.detecting.sink import Timeouts
+from sliplab.flows.detecting.sources import NamedSource, NetworkSource, Source
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.program import ACTING, Move, Program
@@ -33,24 +36,28 @@ class DetectRequest:
     """A requested live detection, checked by `make_detect_request`.
 
     Attributes:
-        detection: the paper's rule by its settings, or another detector with its levels.
+        source: what detects.
+        rig: that reads its streams as often as requested.
         safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until the user ends it.
     """
 
     rig: RigFile
-    model: Path
-    model_sha256: str
-    fitted: Fitted
-    detection: Detection | Tuned
+    source: Source
     plan: Plan | None = None
     trial: Trial | None = None
     reflex: Reflex | None = None
     safe: Reflex | None = None
     seconds: float | None = None
-    stride_ms: float | None = None
-    poll_s: float = POLL_S
+
+    @property
+    def answer_s(self) -> float | None:
+        """Timeout of an answer of the detector's own process; None: it runs in this one."""
+        limit_ns = None if self.timeouts is None else self.timeouts.decision_ns
+        if limit_ns is None:
+            return None
+        return PATIENT_S if self.rig.in_virtual_time else limit_ns / 1e9
 
     @property
     def timeouts(self) -> Timeouts | None:
@@ -74,7 +81,7 @@ class DetectRequest:
 
 def make_detect_request(
     rig: Path,
-    model: Path,
+    model: Path | None,
     *,
     protocol: Path | None = None,
     trial: str | None = None,
@@ -86,33 +93,29 @@ def make_detect_request(
     margin: float | None = None,
     smoothing: int | None = None,
     poll_s: float = POLL_S,
-    detector: Tuned | None = None,
+    detector: Tuned | NamedSource | None = None,
 ) -> DetectRequest:
     """Read and check everything that can be known before anything moves.
 
     Args:
-        detector: instead of the protocol's rule.
+        model: a network; None where `detector` is another one.
+        detector: instead of the network with the protocol's rule, or instead of the rule.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
     """
     file, _ = load_rig_file(rig)
-    fitted = load_model(model)
-    fitted.check_slip(model, "detection")
     given = (("margin", margin), ("smoothing", smoothing))
     change = {name: value for name, value in given if value is not None}
-    ruled = partial(_detection, fitted=fitted, change=change)
-    if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:
-        right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
-        raise InputError("--stride", "", f"{stride_ms:g} ms", right)
-    requested = partial(
-        DetectRequest,
-        model=model,
-        model_sha256=sha256(model),
-        fitted=fitted,
-        stride_ms=stride_ms,
-        poll_s=poll_s,
-    )
+    if isinstance(detector, NamedSource):
+        named = detector
+
+        def source(stated: AnalysisSettings | None) -> Source:
+            return named
+
+    else:
+        assert model is not None
+        source = _network(model, stride_ms, detector, change)
     if protocol is None:
         for name, text in (("--trial", trial), ("--reflex", reflex)):
             if text is not None:
@@ -121,10 +124,9 @@ def make_detect_request(
         if seconds is None and file.in_virtual_time:
             right = f"is needed on {file.name}: its time is virtual and has no end"
             raise InputError("--seconds", "", None, right)
-        return requested(
-            rig=file,
-            detection=detector
-            or _detection(AnalysisSettings(network=fitted.network), fitted, change),
+        return DetectRequest(
+            rig=_read_often(file, poll_s),
+            source=source(None),
             seconds=seconds,
         )
     if seconds is not None:
@@ -135,14 +137,37 @@ def make_detect_request(
     if plan.protocol.collection.plate is not None and not file.has_plate:
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     chosen = choose_trial(plan, trial)
-    return requested(
-        rig=with_level(file, plan) if file.simulated else file,
-        detection=detector or ruled(plan.protocol.analysis),
+    return DetectRequest(
+        rig=_read_often(with_level(file, plan) if file.simulated else file, poll_s),
+        source=source(plan.protocol.analysis),
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
         safe=None if reflex is None else make_safe_state(file, plan),
     )
+
+
+def _read_often(file: RigFile, poll_s: float) -> RigFile:
+    """Return a rig that reads its streams at least this often."""
+    return file.model_copy(update={"poll": min(file.poll, Decimal(str(poll_s)))})
+
+
+def _network(
+    model: Path, stride_ms: float | None, tuned: Tuned | None, change: Mapping[str, float]
+) -> Callable[[AnalysisSettings | None], Source]:
+    """Return a function of a protocol's settings, if any, that makes the source of a network.
+
+    Raises:
+        InputError: the model or the stride.
+    """
+    fitted = load_model(model)
+    fitted.check_slip(model, "detection")
+    if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:
+        right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
+        raise InputError("--stride", "", f"{stride_ms:g} ms", right)
+    network = partial(NetworkSource, model, sha256(model), fitted, stride_ms=stride_ms)
+    own = AnalysisSettings(network=fitted.network)
+    return lambda stated: network(detection=tuned or _detection(stated or own, fitted, change))
 
 
 def load_model(path: Path) -> Fitted:

@@ -15,6 +15,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from sliplab.analysis.detectors.detector import DetectorError
 from sliplab.analysis.detectors.live import (
     UNDECIDED,
     ClockFellBack,
@@ -25,7 +26,7 @@ from sliplab.analysis.detectors.live import (
     TimedDecision,
 )
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
-from sliplab.flows.detecting.network_process import NetworkLost
+from sliplab.flows.detecting.detector_process import NetworkLost
 from sliplab.rigs.core.capabilities import Clock
 from sliplab.rigs.core.reacting import DetectionTimes, SenseLost, SlipDetected
 from sliplab.storage.streams import EVENTS_KIND, Chunk, EventChunk, NullSink, PulseChunk
@@ -35,6 +36,19 @@ PATIENCE_US = 200_000
 here: events that were sent earlier must have arrived by then."""
 KEPT = 100_000
 """Latencies stored for the summary: the last 55 minutes of 30 ms windows."""
+
+
+FAILURES: dict[type[Exception], str] = {
+    ClockFellBack: "event camera",
+    NetworkLost: "network",
+    DetectorError: "detector",
+}
+"""Exceptions of a detector on a stream, each with the device that it is reported of."""
+
+
+def failed_device(error: Exception) -> str:
+    """Return the device of one of `FAILURES`."""
+    return next(device for kind, device in FAILURES.items() if isinstance(error, kind))
 
 
 @dataclass(frozen=True)
@@ -186,11 +200,10 @@ class DetectSink(NullSink):
         """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""
         try:
             return work()
-        except (ClockFellBack, NetworkLost) as error:
+        except tuple(FAILURES) as error:
             if not self.guarded:
                 raise
-            device = "event camera" if isinstance(error, ClockFellBack) else "network"
-            raise SenseLost(f"{device}: {error}") from error
+            raise SenseLost(f"{failed_device(error)}: {error}") from error
 
     def _report(self, made: list[LiveDecision], here_ns: int, began_ns: int) -> None:
         slip: DetectionTimes | None = None

@@ -27,10 +27,10 @@ class DetectView:
 
     Args:
         title: says "simulated" where that is so.
-        most: spikes that a class can give in a window.
+        most: spikes that a class can give in a window; None for a detector without a network.
     """
 
-    def __init__(self, title: str, most: int) -> None:
+    def __init__(self, title: str, most: int | None) -> None:
         self._title, self._most = title, most
         self._rate: deque[tuple[float, int]] = deque(maxlen=34)
         self._last: deque[str] = deque(maxlen=LAST)
@@ -84,9 +84,10 @@ class DetectView:
     def _picture(self) -> Group:
         table = Table.grid(padding=(0, 1))
         timed = self._now
-        for number, name in enumerate(CLASSES):
-            mean = 0.0 if timed is None else timed.decision.smoothed[number]
-            filled = min(WIDTH, round(WIDTH * mean / self._most))
+        smoothed = None if timed is None else timed.decision.smoothed
+        for number, name in enumerate(CLASSES if self._most else ()):
+            mean = 0.0 if smoothed is None else smoothed[number]
+            filled = min(WIDTH, round(WIDTH * mean / (self._most or 1)))
             bar = Text("█" * filled + "·" * (WIDTH - filled), style=_STYLES[number])
             table.add_row(name.replace("_", " "), bar, f"{mean:5.2f}")
         if timed is None:
@@ -102,11 +103,13 @@ class DetectView:
 
 def _line(timed: TimedDecision) -> str:
     made = timed.decision
-    counts = "/".join(str(count) for count in made.counts)
+    said = f"evidence {made.value:.3g}"
+    if made.counts is not None:
+        said = f"spikes {'/'.join(str(count) for count in made.counts)}"
     late = "" if timed.latency_ms is None else f", {timed.latency_ms:.1f} ms after its last event"
     onset = f"; first {made.onset}" if made.onset else ""
     phase = f" ({timed.phase})" if timed.phase else ""
     return (
         f"{timed.trial_s:8.3f} s{phase} camera {made.end_us} us: "
-        f"{timed.state.replace('_', ' ')}, spikes {counts}{late}{onset}"
+        f"{timed.state.replace('_', ' ')}, {said}{late}{onset}"
     )

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.plugins.bench.interface import Evidence, Slip
+from sliplab.analysis.detectors.detector import Evidence, Slip
 
 ALARM_US = 1_000_000
 US_PER_HOUR = 3_600_000_000

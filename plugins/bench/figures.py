@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.analysis.detectors.detector import NO_LABEL
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.metrics.intervals import median_interval
@@ -26,7 +27,6 @@ from sliplab.plugins.bench.document import (
     BenchScores,
     MedianLatency,
 )
-from sliplab.plugins.bench.interface import NO_LABEL
 from sliplab.storage.schema.evaluation import AlarmRate
 
 RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)

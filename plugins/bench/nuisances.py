@@ -10,7 +10,7 @@ from decimal import Decimal
 import numpy as np
 
 from sliplab.protocols.nuisances import SHIPPED, TrialNuisances
-from sliplab.rigs.mock.fault_kinds import AnyFault
+from sliplab.rigs.core.faults import AnyFault
 from sliplab.rigs.mock.nuisances import faults_of
 from sliplab.rigs.mock.settings import MockSettings
 

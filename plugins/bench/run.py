@@ -16,12 +16,15 @@ from functools import cached_property, lru_cache
 from multiprocessing import active_children
 from pathlib import Path
 
+from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.registry import contents, make_detector
 from sliplab.flows.running import console, stopping
 from sliplab.plugins.bench import scenes
 from sliplab.plugins.bench.alarms import SceneEvidence, hours_without_slip
+from sliplab.plugins.bench.audit import audit
 from sliplab.plugins.bench.definition import SIZES, VERSION, Size
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, KeptDetector
-from sliplab.plugins.bench.feeding import BenchError, audit, feed
 from sliplab.plugins.bench.figures import (
     Level,
     accuracy,
@@ -31,9 +34,7 @@ from sliplab.plugins.bench.figures import (
     tested,
     validated,
 )
-from sliplab.plugins.bench.interface import Detector, Evidence, Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
-from sliplab.plugins.bench.registry import contents, make_detector
 from sliplab.plugins.bench.scenes import SceneDraw
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import out_of_reach
@@ -221,7 +222,7 @@ def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
     try:
         prepared = prepare(detector, bench.training, bench.advance)
         row = measure(job.name, prepared, bench.tests, bench.advance)
-    except BenchError as error:
+    except DetectorError as error:
         raise InputError("DETECTOR", "", job.name, str(error)) from None
     finally:
         detector.close()

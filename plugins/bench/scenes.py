@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.analysis.detectors.detector import Scene, Slip
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.plugins.bench.definition import DEFINITION, VERSION, ScenePart, Size, Span
-from sliplab.plugins.bench.interface import Scene, Slip
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
 from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan
@@ -18,7 +18,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.mock.fault_kinds import AnyFault
+from sliplab.rigs.core.faults import AnyFault
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import EventChunk

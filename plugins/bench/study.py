@@ -63,13 +63,13 @@ def measure(
     ] = None,
 ) -> Finding[BenchResult]:
     """Judge detectors on simulated scenes: latency at a false alarm an hour, and its cost."""
+    from sliplab.plugins.bench import PLUGIN
     from sliplab.plugins.bench.plot import latency_against_alarms
-    from sliplab.plugins.bench.registry import SHIPPED
     from sliplab.plugins.bench.run import run_bench
 
     if leaderboard is not None:
         _around(leaderboard)  # wrong input fails before anything is simulated
-    size, names = "small" if small else "full", detectors or tuple(SHIPPED)
+    size, names = "small" if small else "full", detectors or tuple(PLUGIN.detectors)
     found = run_bench(names, size, seed, folder, workers or os.cpu_count() or 1)
     svg = latency_against_alarms(found)
     if leaderboard is not None:

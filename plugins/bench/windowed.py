@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import log_softmax
 
+from sliplab.analysis.detectors.detector import Detector, Evidence, Scene
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.samples import choose_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
-from sliplab.plugins.bench.interface import Detector, Evidence, Scene
 from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 

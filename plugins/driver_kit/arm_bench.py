@@ -86,8 +86,15 @@ class ArmBench(DeviceBench):
     clock: ControllerClock | None = None
     wraps_s: tuple[float, ...] = ()
 
-    def __init__(self, driver: ArmDriver[Any], settings: BaseArmSettings, bounds: Bounds) -> None:
+    def __init__(
+        self,
+        driver: ArmDriver[Any],
+        settings: BaseArmSettings,
+        bounds: Bounds,
+        measures: bool = False,
+    ) -> None:
         super().__init__(bounds)
+        self._build = driver.builder(measures)
         if driver.fake is None:
             raise NotTried(f"{driver.name} declares no fake")
         self.driver, self._fake, self.twists = driver, driver.fake, driver.twists
@@ -107,7 +114,7 @@ class ArmBench(DeviceBench):
         self.fake: FakeController = self._fake(settings, scene)
         self.wraps_s = wraps_s(self.fake)
         self.fake.start()
-        self.arm: Arm = self.driver.build(settings)
+        self.arm: Arm = self._build(settings)
 
     def restart(self, clock_s: float = CLOCK_S, limits: ArmLimits | None = None) -> None:
         """Close device and fake, and make others, whose clock shows another time.

@@ -129,7 +129,7 @@ class FrameBench(StreamBench):
         if driver.fake is None:
             raise NotTried(f"{driver.name} declares no fake")
         self._fake, self._unplug = driver.fake, driver.unplug
-        self.on_frames: Callable[[FrameChunk], None] = lambda frames: None
+        self._on_frames: Callable[[FrameChunk], None] = lambda frames: None
         self.shape = SIZE
         self.mid_exposure_ns = round(settings.exposure_us * 500)
         self.region = SIZE
@@ -217,22 +217,23 @@ class FrameBench(StreamBench):
     def close_fake(self) -> None:
         """Nothing to close: the fake is the camera's."""
 
-    def grab(self, width_px: int, height_px: int) -> None:
+    def grab(self, width_px: int, height_px: int, on_frames: Callable[[FrameChunk], None]) -> None:
         """Begin to expose a region."""
+        self._on_frames = on_frames
         self.shape, self._number, self._grabbing = (width_px, height_px), 0, True
         self._begun_ns = time.monotonic_ns()
 
     def stop_grabbing(self) -> None:
         """Stop; an empty chunk ends the frames."""
         self._grabbing = False
-        self.on_frames(self._chunk(0))
+        self._on_frames(self._chunk(0))
 
     def feed(self) -> None:
         """Expose a frame, each unlike the one before."""
         if self._grabbing:
             chunk = self._chunk(1)
             self.fed.append(chunk)
-            self.on_frames(chunk)
+            self._on_frames(chunk)
 
     def _chunk(self, count: int) -> FrameChunk:
         t_ns, (width, height) = self.times(count, FRAME_NS), self.shape

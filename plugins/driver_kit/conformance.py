@@ -110,7 +110,7 @@ def cases(
     if arm is None:
         return of(lambda: ForceBench(driver, settings, limits), *rules)
     return of(
-        lambda: ArmForceBench(driver, settings, limits, ArmBench(*arm, limits)),
+        lambda: ArmForceBench(driver, settings, limits, ArmBench(*arm, limits, measures=True)),
         *rules,
     )
 

@@ -9,20 +9,19 @@ safe state.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from sliplab.analysis.detectors.detectors import Tuned
-from sliplab.analysis.detectors.live import Counting, counting_of
+from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.detector import Detector, Evidence, StreamDetector
+from sliplab.analysis.detectors.registry import contents
 from sliplab.analysis.sweeps.runner import ResultFile, Sweep
-from sliplab.flows.detect import detect
+from sliplab.flows.detect import BuildRig, detect
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request, make_reflex
+from sliplab.flows.detecting.sources import NamedSource, Source
 from sliplab.flows.running import console
 from sliplab.flows.store_detectors import detectors_of
 from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
@@ -31,12 +30,12 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
-from sliplab.storage.streams import Json
+from sliplab.storage.streams import EventChunk, Json
 
 NAME = "reflex"
 VERSION = 1
@@ -47,12 +46,15 @@ STEP_MS = 20
 """Step of the stored heights."""
 
 
-def _no_slip(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    return np.array([[1, 0, 0]], np.int64)
+class _Never(Detector):
+    """Says nothing, for trials without a reflex."""
 
+    def begin(self, width: int, height: int) -> None:
+        """See `Detector`."""
 
-_NEVER: Counting = _no_slip
-"""No-slip outputs for trials without a reflex, in which nothing is detected."""
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        """See `Detector`."""
+        return Evidence.of([], [])
 
 
 @dataclass(frozen=True)
@@ -136,20 +138,24 @@ def request(
     for trial in trials:
         cases.append(ReflexCase(trial, None, None, hash_data([made, trial.id])))
         for name, asked in requests.items():
-            rule = _numbers(asked.detection)
+            digest, rule = _identity(asked.source)
             for reflex in reflexes:
                 make_reflex(reflex, file, plan, trial, HOLD_S)  # raises before anything moves
-                key = hash_data([made, trial.id, asked.model_sha256, rule, reflex])
+                key = hash_data([made, trial.id, digest, rule, reflex])
                 cases.append(ReflexCase(trial, name, reflex, key))
     return Request(next(iter(requests.values())).rig, plan, requests, cases, out)
 
 
-def _numbers(detection: Detection | Tuned) -> Json:
-    """Return the settings of a rule, or the hash of another detector's numbers."""
+def _identity(source: Source) -> tuple[str, Json]:
+    """Return the hash of what detects, and the numbers that it decides by."""
+    if isinstance(source, NamedSource):
+        store = None if source.store is None else str(source.store.resolve())
+        return hash_data([source.name, contents(source.name)]), {"level": source.level, "of": store}
+    detection = source.detection
     if isinstance(detection, Detection):
-        return detection.model_dump(mode="json")
+        return source.sha256, detection.model_dump(mode="json")
     text = json.dumps(asdict(detection), default=lambda array: array.tolist())
-    return {"name": detection.name, "numbers": hash_text(text)}
+    return source.sha256, {"name": detection.name, "numbers": hash_text(text)}
 
 
 def measure_reflexes(asked: Request) -> ReflexStudy:
@@ -164,14 +170,17 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
         "rig": asked.rig.name,
         "protocol": asked.plan.name,
         "virtual_time": asked.rig.in_virtual_time,
-        "detectors": {name: it.model_sha256 for name, it in asked.requests.items()},
+        "detectors": {name: _identity(it.source)[0] for name, it in asked.requests.items()},
     }
     saved = ResultFile(asked.out / f"{NAME}.json", ReflexStudy, "trials", head)
     with ExitStack() as done:
         build = done.enter_context(_builder(asked.rig))
-        networks = {name: counting_of(it.fitted) for name, it in asked.requests.items()}
+        detectors = {
+            name: done.enter_context(it.source.running(None, it.rig.calibration.centre_px))
+            for name, it in asked.requests.items()
+        }
         sweep = Sweep(
-            asked.cases, saved, lambda case, _: (measure(asked, case, networks, build), None)
+            asked.cases, saved, lambda case, _: (measure(asked, case, detectors, build), None)
         )
         simulated = "simulated trials" if asked.rig.in_virtual_time else "trials in real time"
         bar = done.enter_context(console.bar(f"reflexes ({simulated})", len(sweep.pending)))
@@ -183,7 +192,7 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
 
 
 @contextmanager
-def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
+def _builder(file: RigFile) -> Iterator[BuildRig]:
     """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
     if file.in_virtual_time:
         yield build_rig
@@ -193,7 +202,7 @@ def _builder(file: RigFile) -> Iterator[Callable[[RigFile], Rig]]:
     assert file.devices is not None
     stage = Loopback(file.scene, file.timing, file.devices, file.streams)
     try:
-        yield lambda rig: loopback_rig(rig, stage)
+        yield lambda rig, should_stop: loopback_rig(rig, stage, should_stop)
     finally:
         stage.close()
 
@@ -206,11 +215,11 @@ class Seen:
     truth: Truth | None = None
     course: PlateCourse | None = None
 
-    def by(self, build: Callable[[RigFile], Rig]) -> Callable[[RigFile], Rig]:
+    def by(self, build: BuildRig) -> BuildRig:
         """Return a function that builds the same rig, observed."""
 
-        def observed(file: RigFile) -> Rig:
-            rig = build(file)
+        def observed(file: RigFile, should_stop: ShouldStop) -> Rig:
+            rig = build(file, should_stop)
             take_step = rig.take_step
 
             def looking(index: int, step: Step, *rest: Any) -> Any:
@@ -232,23 +241,24 @@ class Seen:
 def measure(
     asked: Request,
     case: ReflexCase,
-    networks: Mapping[str, Counting],
-    build: Callable[[RigFile], Rig] = build_rig,
+    detectors: Mapping[str, StreamDetector],
+    build: BuildRig = build_rig,
 ) -> ReflexTrial:
     """Run one trial.
 
     Args:
-        networks: by the names of their detectors.
+        detectors: by their names.
     """
     plan, trial = asked.plan, case.trial
-    wanted, counting = next(iter(asked.requests.values())), _NEVER
+    wanted = next(iter(asked.requests.values()))
+    detector: StreamDetector = AtLevel(_Never(), 0.0)
     if case.detector is not None and case.reflex is not None:
         made = make_reflex(case.reflex, asked.rig, plan, trial, HOLD_S)
         wanted = replace(asked.requests[case.detector], reflex=made)
-        counting = networks[case.detector]
+        detector = detectors[case.detector]
     seen = Seen()
     order = replace(wanted, trial=trial)
-    summary = detect(order, counting=counting, build=seen.by(build), show=False)
+    summary = detect(order, detector=detector, build=seen.by(build), show=False)
     truth, course = seen.truth, seen.course
     assert truth is not None
     assert course is not None

@@ -56,8 +56,8 @@ def measure(
         list[str] | None,
         typer.Option(
             "--detector",
-            help="Of a store: network or paper (with the rule), or another. Repeatable. Default: "
-            "all.",
+            help="Of a store: network or paper (with the rule), or another; or any of `sliplab "
+            "bench`. Repeatable. Default: all of the store.",
         ),
     ] = None,
     trials: Annotated[

@@ -132,10 +132,16 @@ class ArmDriver(Driver[ArmSettingsT]):
     kind = "arm"
     build: Callable[[ArmSettingsT], Arm] = field(kw_only=True)
     """Make the device, not connected yet."""
+    build_measuring: Callable[[ArmSettingsT], Arm] | None = None
+    """The same, of an arm that also sends its wrench, for a `ForceSensorDriver.of_arm`."""
     twists: bool = True
     """It can turn the tool on the spot at a speed (`Segment.turn_deg_s`)."""
     fake: Callable[[ArmSettingsT, ArmScene], FakeController] | None = None
     """Build a fake controller, not started yet; None: not available on a loopback rig."""
+
+    def builder(self, measures: bool) -> Callable[[ArmSettingsT], Arm]:
+        """Return what makes the device; with `measures`, one that sends its wrench if it can."""
+        return (measures and self.build_measuring) or self.build
 
 
 class FakeEventCamera(Protocol):
@@ -171,11 +177,12 @@ class EventCameraDriver(Driver[SettingsT]):
 class SceneFrames(Protocol):
     """The frames of a simulated scene in another process."""
 
-    on_frames: Callable[[FrameChunk], None]
-    """Called in a thread with every chunk of frames."""
+    def grab(self, width_px: int, height_px: int, on_frames: Callable[[FrameChunk], None]) -> None:
+        """Start to expose a centred region.
 
-    def grab(self, width_px: int, height_px: int) -> None:
-        """Start to expose a centred region."""
+        Args:
+            on_frames: called in a thread with every chunk of frames, until the next grab.
+        """
 
     def stop_grabbing(self) -> None:
         """Stop; an empty chunk ends the frames."""

@@ -211,33 +211,26 @@ class FakeStream(ABC):
 
 
 CLOCK_BACK_S = 5.0
+"""By which `Kind.CLOCK_BACK` sets the controller's clock back."""
 PACKETS_LOST = 25
+"""Packets of poses that `Kind.PACKETS_LOST` keeps back."""
 
 
 class Kind(Enum):
-    """A kind of fault."""
+    """Faults of a fake arm controller, by their names in the table (`rigs.core.faults`)."""
 
-    PROTECTIVE_STOP = "protective stop"
-    EMERGENCY_STOP = "emergency stop"
-    LINK_CUT = "link cut"
-    """Every connection is closed and no new one is accepted."""
-    SILENCE = "silence"
-    """Connections stay open and are accepted, but nothing is answered or sent."""
-    REMOTE_OFF = "remote control off"
-    PROGRAM_END = "program end"
-    """The operator presses stop at the pendant."""
-    PROGRAM_PAUSED = "program paused"
-    """The operator presses pause at the pendant."""
-    SAFEGUARD_STOP = "safeguard stop"
-    """A light curtain or a door stops the arm; a running program is paused."""
-    POWER_OFF = "power off"
-    """The operator switches the arm off, but not its controller."""
-    CLOCK_BACK = "clock back"
-    """The controller's clock jumps back by `CLOCK_BACK_S`."""
-    PACKETS_LOST = "packets lost"
-    """The next `PACKETS_LOST` packets of poses are not sent."""
-    LATE_ANSWER = "late answer"
-    """The answer to the next request comes only with the answer to the one after it."""
+    PROTECTIVE_STOP = "arm_protective_stop"
+    EMERGENCY_STOP = "arm_emergency_stop"
+    LINK_CUT = "device_gone"
+    SILENCE = "device_silent"
+    REMOTE_OFF = "arm_remote_off"
+    PROGRAM_END = "arm_program_end"
+    PROGRAM_PAUSED = "arm_program_paused"
+    SAFEGUARD_STOP = "arm_safeguard_stop"
+    POWER_OFF = "arm_power_off"
+    CLOCK_BACK = "clock_jump"
+    PACKETS_LOST = "poses_lost"
+    LATE_ANSWER = "answer_late"
 
 
 class Stage(Enum):

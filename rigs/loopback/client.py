@@ -47,9 +47,6 @@ class Loopback:
 
     It is also the `Simulation`, `Plate` and `Operator` of the rig (`rigs.core.capabilities`).
 
-    Args:
-        on_frames: called in a thread with the frames of the outside camera.
-
     Attributes:
         addresses: where the driver of each device finds its fake: by `event_camera`, `sync_box`,
             `force_sensor`, `gripper`, or `STREAMS` and the name of a further event camera's stream.
@@ -72,7 +69,7 @@ class Loopback:
         }
         ours, theirs = WORKERS.Pipe()
         self._frames, their_frames = WORKERS.Pipe(duplex=False)
-        self.on_frames: Callable[[FrameChunk], None] = _forget
+        self._on_frames: Callable[[FrameChunk], None] = _forget
         self._process = WORKERS.Process(
             target=_serve,
             args=(theirs, their_frames, settings, timing, devices, further),
@@ -161,8 +158,9 @@ class Loopback:
 
     # -- the frame camera ------------------------------------------------------------------
 
-    def grab(self, width_px: int, height_px: int) -> None:
-        """Start the frame camera; frames are passed to `on_frames`."""
+    def grab(self, width_px: int, height_px: int, on_frames: Callable[[FrameChunk], None]) -> None:
+        """Start the frame camera; see `rigs.core.driver.SceneFrames`."""
+        self._on_frames = on_frames
         self._ask("grab", width_px, height_px)
 
     def stop_grabbing(self) -> None:
@@ -219,7 +217,7 @@ class Loopback:
         with suppress(EOFError, OSError):
             while True:
                 frames = self._frames.recv()
-                self.on_frames(frames)  # looked up now, because it may have changed meanwhile
+                self._on_frames(frames)  # of the last grab
 
 
 def _forget(frames: FrameChunk) -> None:

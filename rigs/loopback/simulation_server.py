@@ -31,6 +31,7 @@ from sliplab.rigs.core.driver import (
 )
 from sliplab.rigs.core.fake_motion import ControllerClock
 from sliplab.rigs.core.fakes import Kind
+from sliplab.rigs.core.faults import wired
 from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.device_section import DeviceSettings
@@ -54,14 +55,6 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
 
 CAMERA = "event_camera"
-FAULTS = {
-    "sync_box": ("reset", "silence"),
-    CAMERA: ("stall",),
-    "force_sensor": ("silence", "overload"),
-    "gripper": ("silence", "fail"),
-}
-"""Faults of each fake but the arm's, by the names of its methods; further cameras have the first
-one's."""
 REACH_MM = 2_000.0
 """Reach of the fake arm; the driver enforces the rig file's limits."""
 I64 = npt.NDArray[np.int64]
@@ -369,18 +362,17 @@ class SimulationServer:
         Args:
             device: ``arm``, ``sync_box``, ``event_camera``, ``force_sensor``, ``gripper``, or the
                 name of a further event camera's stream.
-            kind: for the arm a value of `rigs.core.fakes.Kind`; for another ``unplug``, or one of
-                its `FAULTS`.
+            kind: of the table of faults (`rigs.core.faults`).
 
         Raises:
             RigError: no such fault.
         """
         known: dict[str, Callable[[], None]] = {}
         if device == "arm":
-            known = {found.value: partial(self.arm.inject, found) for found in Kind}
+            known = {found: partial(self.arm.inject, Kind(found)) for found in wired(device)}
         elif (fake := self._fakes.get(name := self._name(device))) is not None:
-            known = {fault: getattr(fake, fault) for fault in FAULTS.get(name, FAULTS[CAMERA])}
-            known["unplug"] = fake.close
+            faults = wired(CAMERA if name.startswith(STREAMS) else device)
+            known = {found: getattr(fake, method) for found, method in faults.items()}
         if kind not in known:
             raise RigError(device, f"its fake cannot simulate '{kind}'")
         known[kind]()

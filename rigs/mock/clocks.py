@@ -12,8 +12,8 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.rigs.core.faults import ClockDrift, ClockJump, ClockRestart, Device
 from sliplab.rigs.mock.fault_book import FaultBook
-from sliplab.rigs.mock.fault_kinds import ClockDrift, ClockJump, ClockRestart, Device
 from sliplab.rigs.mock.settings import ClockErrors
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.clockmap import ClockMap

@@ -11,9 +11,9 @@ from typing import Any, TypeVar, cast
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.timing import FrameGrade, Timing
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
+from sliplab.rigs.core.faults import DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.fault_kinds import DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
 from sliplab.rigs.mock.further_settings import FurtherEventCamera, FurtherFrameCamera, Thermometer

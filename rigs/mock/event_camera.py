@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.rigs.core.faults import EventBurst, EventNoise
 from sliplab.rigs.mock.clocks import HighestStamp
 from sliplab.rigs.mock.fault_book import NEVER
-from sliplab.rigs.mock.fault_kinds import EventBurst, EventNoise
 from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.nuisances import brushing

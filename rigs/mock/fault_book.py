@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.mock.fault_kinds import (
+from sliplab.rigs.core.faults import (
     AnyFault,
     ArmProtectiveStop,
     ArmRamp,

@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.faults import DeviceGone, FrameLate, FramesLost, MarkerOccluded
 from sliplab.rigs.mock.clocks import Jitter, Lateness
 from sliplab.rigs.mock.fault_book import NEVER
-from sliplab.rigs.mock.fault_kinds import DeviceGone, FrameLate, FramesLost, MarkerOccluded
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
 from sliplab.rigs.mock.sync import ClockReader, FreeRun, Ticks

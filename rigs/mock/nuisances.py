@@ -22,8 +22,7 @@ from sliplab.protocols.nuisances import (
     VibrationNuisance,
     Warmth,
 )
-from sliplab.rigs.mock.fault_book import FaultBook
-from sliplab.rigs.mock.fault_kinds import (
+from sliplab.rigs.core.faults import (
     AnyFault,
     EventGap,
     EventNoise,
@@ -32,6 +31,7 @@ from sliplab.rigs.mock.fault_kinds import (
     Shaking,
     SkinBrushed,
 )
+from sliplab.rigs.mock.fault_book import FaultBook
 from sliplab.rigs.mock.settings import MockEventCameraSettings
 from sliplab.rigs.scene.randomness import generator
 

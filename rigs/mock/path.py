@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.core.fake_motion import Ramp
+from sliplab.rigs.core.faults import ArmOffPath
 from sliplab.rigs.mock.fault_book import NEVER, FaultBook
-from sliplab.rigs.mock.fault_kinds import ArmOffPath
 from sliplab.rigs.mock.settings import PlatePosition
 
 F64 = npt.NDArray[np.float64]

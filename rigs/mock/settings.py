@@ -19,9 +19,9 @@ from sliplab.protocols.nuisances import FlickerNuisance
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.timing import Delay, ForceTiming, Timing
 from sliplab.protocols.yaml_file import StrictModel, rule
+from sliplab.rigs.core.faults import Fault, StreamGone, check_papillae, check_single
 from sliplab.rigs.core.gripper_range import GripperRange
 from sliplab.rigs.core.sections import SimulatedRig, SimulatedStream
-from sliplab.rigs.mock.fault_kinds import Fault, StreamGone, check_papillae, check_single
 from sliplab.rigs.scene.optics import EventOptics, Finite, NonNegative, Positive, Reflections
 
 if TYPE_CHECKING:

@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
-from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
-from sliplab.rigs.mock.fault_book import NEVER
-from sliplab.rigs.mock.fault_kinds import (
+from sliplab.rigs.core.faults import (
     DeviceGone,
     PulsesDuplicated,
     PulsesLate,
     PulsesLost,
 )
+from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
+from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
+from sliplab.rigs.mock.fault_book import NEVER
 from sliplab.rigs.mock.identity import Identity
 from sliplab.rigs.mock.settings import MockFrameCameraSettings
 from sliplab.rigs.mock.world import SimulatedWorld

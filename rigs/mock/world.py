@@ -19,10 +19,10 @@ import numpy.typing as npt
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.faults import PlateStuck
 from sliplab.rigs.core.finger_motion import FingerMotion
 from sliplab.rigs.mock.clocks import ClockMaps, own_clock, shifted, trial_clocks, with_faults
 from sliplab.rigs.mock.fault_book import FaultBook
-from sliplab.rigs.mock.fault_kinds import PlateStuck
 from sliplab.rigs.mock.history import GrowingTable
 from sliplab.rigs.mock.nuisances import Shake, faults_of
 from sliplab.rigs.mock.path import SENSOR, ArmPath, Leg, ToolDeviation, TrueSurface

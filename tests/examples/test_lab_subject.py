@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.detectors.registry import known, make_detector
 from sliplab.analysis.evaluation.classes import class_evaluation_of
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file
@@ -23,13 +24,15 @@ from sliplab.flows.cli import app as cli
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome, searches
-from sliplab.plugins.bench.registry import known, make_detector
 from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer
+from tests.conftest import ROOT
 from tests.examples.conftest import install
 from tests.flows.class_store import adapter, class_store
+from tests.flows.conftest import write
+from tests.flows.detect.detecting import short_slide
 
 Ran = tuple[list[RunRequest], StudyOutcome]
 
@@ -118,3 +121,14 @@ def test_detector_is_the_same_in_any_pieces() -> None:
     np.testing.assert_array_equal(*found)
     assert len(found[0]) == 60
     assert found[0][50] > 10 > found[0][1:50].max()
+
+
+@pytest.mark.usefixtures("subject")
+def test_detector_runs_live_and_in_a_reflex(tmp_path: Path) -> None:
+    rig, named = ROOT / "rigs" / "rehearsal.yaml", ("--detector", "lab_jump", "--level", "0.5")
+    found = answer("detect", "--rig", rig, *named, "--seconds", "1", "--out", tmp_path / "d.jsonl")
+    assert found["detector"] == "lab_jump"
+    assert found["windows"] >= 95
+    protocol = write(tmp_path / "p.yaml", short_slide())
+    moving = ("--protocol", protocol, "--trial", "", "--reflex", "stop", "--hold", "0.1")
+    assert answer("detect", "--rig", rig, *named, *moving)["reflex"]["phase"] == "slide"

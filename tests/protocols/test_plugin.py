@@ -121,14 +121,16 @@ def test_one_that_is_broken_is_named_and_harms_no_other(
 
 def test_names_from_before_a_move_still_work() -> None:
     code = (
-        "import sliplab.analysis.bench.interface as old, sliplab.plugins.bench.interface as new;"
-        "from sliplab.analysis.bench import registry; import sliplab.plugins.bench.registry as r;"
+        "import sliplab.analysis.bench.interface as old, sliplab.plugins.bench.interface as later;"
+        "import sliplab.analysis.detectors.detector as new;"
+        "from sliplab.analysis.bench import registry;"
+        "import sliplab.analysis.detectors.registry as r;"
         "from sliplab.protocols.conditions import Gates; import sliplab.protocols.gates as g;"
         "from sliplab.protocols.settings import Detection, Labelling, Split, Training, Windows;"
         "assert Gates is g.Gates;"
-        "print(old is new, registry is r, new.__spec__.name)"
+        "print(old is later is new, registry is r, new.__spec__.name)"
     )
-    assert said_by(code).split() == ["True", "True", "sliplab.plugins.bench.interface"]
+    assert said_by(code).split() == ["True", "True", "sliplab.analysis.detectors.detector"]
 
 
 def test_help_names_a_plug_in_that_cannot_be_used(installed: Any, capsys: Any) -> None:

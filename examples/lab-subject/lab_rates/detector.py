@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.plugins.bench.interface import Detector, Evidence
+from sliplab.analysis.detectors.detector import Detector, Evidence
 from sliplab.storage.streams import EventChunk
 
 STEP_US, STEPS = 10_000, 100

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
+from sliplab.analysis.detectors.detector import Cost, Scene
 from sliplab.analysis.networks.baselines import features, fitted_trees
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
 from sliplab.protocols.windows import Windows
 

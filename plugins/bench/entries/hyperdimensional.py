@@ -14,10 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.detector import Cost, Scene
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.baselines import cell_sums
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
 from sliplab.protocols.windows import Windows
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.detector import Cost, Scene
 from sliplab.analysis.networks.baseline_nets import fitted_net, net_votes
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import Classifier, samples
 from sliplab.protocols.windows import Windows
 

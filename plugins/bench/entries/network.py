@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.detector import Cost, Scene
 from sliplab.analysis.detectors.detectors import DetectionRule, Predictions, TrialWithSlip, learn
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.smoothing_rule import paper_level, paper_rule
@@ -18,7 +19,6 @@ from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
-from sliplab.plugins.bench.interface import Cost, Scene
 from sliplab.plugins.bench.windowed import WindowDetector, samples
 from sliplab.protocols.settings import AnalysisSettings
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.detector import Cost
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.interface import Cost
 from sliplab.plugins.bench.windowed import MeanOdds, WindowDetector
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.windows import Windows

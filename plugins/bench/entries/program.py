@@ -27,8 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.plugins.bench.feeding import BenchError
-from sliplab.plugins.bench.interface import Detector, Evidence
+from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import start_tethered, started_ticks
 from sliplab.storage.streams import EventChunk
@@ -88,7 +87,7 @@ class ExternalProcess(Detector):
         sent = HEAD.pack(b"EVTS", len(events), until_us) + records.tobytes()
         kind, count, _ = HEAD.unpack(self._exchange(sent, HEAD.size))
         if kind != b"EVID" or count > MOST:
-            raise BenchError(
+            raise DetectorError(
                 f"{self._command}: answered {kind!r} with {count} records; must be b'EVID' with "
                 f"{MOST} at most"
             )
@@ -99,7 +98,7 @@ class ExternalProcess(Detector):
         """Write, and return so many bytes of what is answered.
 
         Raises:
-            BenchError: the program ended, or did not answer in time.
+            DetectorError: the program ended, or did not answer in time.
         """
         left, until_s = memoryview(sent), time.monotonic() + self._answer_s
         with selectors.DefaultSelector() as waiting:
@@ -111,12 +110,12 @@ class ExternalProcess(Detector):
                 ready = waiting.select(max(until_s - time.monotonic(), 0.0))
                 if not ready or time.monotonic() > until_s:
                     self.close()
-                    raise BenchError(
+                    raise DetectorError(
                         f"{self._command}: has not answered in {self._answer_s:g} s, and was killed"
                     )
                 if len(self._read) > MOST * ANSWER.itemsize + HEAD.size:
                     self.close()
-                    raise BenchError(f"{self._command}: writes without end, and was killed")
+                    raise DetectorError(f"{self._command}: writes without end, and was killed")
                 for key, _ in ready:
                     if key.fd == self._output:
                         self._take()
@@ -148,7 +147,7 @@ class ExternalProcess(Detector):
         self.close()
         code = self._process.returncode
         how = f"ended with exit code {code}" if ended else "closed its output"
-        raise BenchError(f"{self._command}: {how}{last}")
+        raise DetectorError(f"{self._command}: {how}{last}")
 
     def _wait(self) -> bool:
         """Wait for the end of the process, bounded; return whether it has ended."""

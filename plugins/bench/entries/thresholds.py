@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sliplab.analysis.detectors.detector import Cost
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.interface import Cost
 from sliplab.plugins.bench.windowed import WindowDetector
 from sliplab.protocols.windows import Windows
 

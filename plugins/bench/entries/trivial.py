@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.plugins.bench.interface import Cost, Detector, Evidence, Scene
+from sliplab.analysis.detectors.detector import Cost, Detector, Evidence, Scene
 from sliplab.storage.streams import EventChunk
 
 STRIDE_US = 10_000

@@ -30,22 +30,15 @@ Load = Callable[[int], Sequence[float]]
 
 
 class SensorFaultKind(Enum):
-    """A kind of fault."""
+    """Faults of this fake, by their names in the table (`rigs.core.faults`); some are counted."""
 
-    SILENCE = "silence"
-    """No more records are sent; the page still answers."""
-    LOSS = "packet loss"
-    """The next `count` records do not arrive."""
-    REORDER = "reordering"
-    """The next record comes after the one that follows it, `count` times."""
-    DUPLICATE = "duplicates"
-    """The next `count` records come twice."""
-    SATURATED = "saturated status"
-    """The next `count` records say that force or torque is out of range."""
-    RESTART = "restart"
-    """The sample counter restarts."""
-    MALFORMED = "malformed records"
-    """The next `count` datagrams are cut short."""
+    SILENCE = "device_silent"
+    LOSS = "records_lost"
+    REORDER = "records_reordered"
+    DUPLICATE = "records_duplicated"
+    SATURATED = "force_overload"
+    RESTART = "clock_restart"
+    MALFORMED = "records_malformed"
 
 
 class FakeNetFt:
@@ -158,7 +151,7 @@ class FakeNetFt:
         return self._to is not None
 
     def inject(self, kind: SensorFaultKind, count: int = 1) -> None:
-        """Inject a fault now."""
+        """Inject a fault now, in so many records; silence lasts."""
         with self._lock:
             if kind is SensorFaultKind.RESTART:
                 self._origin_ns, self._first_ticks = self._now_ns(), 0

@@ -12,8 +12,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
+from sliplab.rigs.core.driver import SceneFrames
 from sliplab.rigs.devices.basler.driver import find_camera
 from sliplab.rigs.devices.basler.fake import EMULATED, emulate
 from sliplab.storage.streams import U8, FrameChunk
@@ -205,18 +206,6 @@ _Frame = tuple[U8, int, int, int]
 """Image, number, middle of the exposure in ns, and level of the sync line."""
 
 
-class FrameSource(Protocol):
-    """The source of the frames."""
-
-    on_frames: Callable[[FrameChunk], None]
-
-    def grab(self, width_px: int, height_px: int) -> None:
-        """Start sending frames of this size."""
-
-    def stop_grabbing(self) -> None:
-        """Stop sending frames; an empty chunk follows the last one."""
-
-
 class LiveBasler:
     """A pypylon `InstantCamera` whose images come from a scene.
 
@@ -234,7 +223,7 @@ class LiveBasler:
 
     def __init__(
         self,
-        scene: FrameSource,
+        scene: SceneFrames,
         mid_exposure_ns: int,
         sync_line: int,
         stored: Mapping[str, Any] | None = None,
@@ -252,7 +241,6 @@ class LiveBasler:
         self.fed = 0
         self._stored = dict(stored or {})
         self._nodes: dict[str, Any] = {}
-        scene.on_frames = self._take
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._device, name)
@@ -374,7 +362,8 @@ class LiveBasler:
         self._device.StartGrabbing(strategy)
         self._feeder = threading.Thread(target=self._feed, name="scene's frames", daemon=True)
         self._feeder.start()
-        self._scene.grab(nodes.GetNode("Width").Value, nodes.GetNode("Height").Value)
+        width_px, height_px = (nodes.GetNode(side).Value for side in ("Width", "Height"))
+        self._scene.grab(width_px, height_px, self._take)
 
     def StopGrabbing(self) -> None:
         """Stop grabbing; earlier frames have reached pylon."""

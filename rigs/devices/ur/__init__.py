@@ -36,6 +36,7 @@ DRIVER = ArmDriver(
     address=lambda settings: settings.host,
     locks=arm_lock,
     build=lazy("sliplab.rigs.devices.ur.driver:UrArm"),
+    build_measuring=lazy("sliplab.rigs.devices.ur.driver:measuring_arm"),
     fake=_fake,
 )
 

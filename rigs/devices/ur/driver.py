@@ -16,7 +16,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from sliplab.rigs.core.capabilities import (
@@ -62,16 +62,26 @@ from sliplab.rigs.devices.ur.settings import (
     WATCHDOG_HZ,
     UrSettings,
 )
+from sliplab.rigs.devices.ur.wrench_log import WrenchLog
 from sliplab.storage.streams import Json
 
 _UNKNOWN_NS = 1 << 62
 """Marks a move that is being sent, before the time of its acceptance is known."""
 
 
-class UrArm(ThreadedArm):
-    """A Universal Robots arm; an `Arm` of `rigs.core.capabilities`."""
+def measuring_arm(settings: UrSettings) -> UrArm:
+    """Return an arm whose controller also sends the wrench at the tool."""
+    return UrArm(settings, WrenchLog())
 
-    def __init__(self, settings: UrSettings) -> None:
+
+class UrArm(ThreadedArm):
+    """A Universal Robots arm; an `Arm` of `rigs.core.capabilities`.
+
+    Args:
+        wrenches: keeps the wrench of every packet; if left out, the controller does not send it.
+    """
+
+    def __init__(self, settings: UrSettings, wrenches: WrenchLog | None = None) -> None:
         super().__init__(settings.limits)
         self._settings = settings
         self._reader: RtdeReader | None = None
@@ -85,9 +95,7 @@ class UrArm(ThreadedArm):
         self._closing = False
         self._moved_ns: int | None = None
         """Host time at which the last move was sent; None once the arm is confirmed at rest."""
-        self.on_wrench: Callable[[int, int, tuple[float, ...]], None] | None = None
-        """Receives the wrench of every packet, with controller and host time, ns; set before the
-        arm is connected, otherwise the controller does not send it."""
+        self.wrenches = wrenches
         self._missing = 0
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
@@ -259,7 +267,7 @@ class UrArm(ThreadedArm):
 
     def _open_stream(self) -> None:
         reader = RtdeReader(self._settings.host, ANSWER_S, SILENCE_S)
-        names = OUTPUTS if self.on_wrench is None else (*OUTPUTS, WRENCH)
+        names = OUTPUTS if self.wrenches is None else (*OUTPUTS, WRENCH)
         try:
             reader.open(names, self._settings.frequency_hz)
         except RtdeError as error:
@@ -372,8 +380,8 @@ class UrArm(ThreadedArm):
         if moved_ns is not None and packet.host_ns > moved_ns + NEWS_S * 1e9 and _rests(status):
             self._rested(moved_ns)
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
-        if self.on_wrench is not None:
-            self.on_wrench(status.t_ns, packet.host_ns, packet.values[-6:])
+        if self.wrenches is not None:
+            self.wrenches.add(status.t_ns, packet.host_ns, packet.values[-6:])
 
     def _rested(self, moved_ns: int) -> None:
         """Record that the arm is at rest after the move of `moved_ns`, if that is the last one."""

@@ -7,28 +7,22 @@ field of each packet, without a separate connection.
 
 from __future__ import annotations
 
-import threading
-from collections import deque
-
 import numpy as np
 
 from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import Arm, ArmState, Mounting, RigError
-from sliplab.rigs.core.pose_stream import BACKLOG_SAMPLES
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.settings import UrWrenchSettings
 from sliplab.storage.streams import Json, WrenchChunk
 
 DEVICE = "force sensor"
-Row = tuple[int, int, tuple[float, ...]]
-"""Controller's clock and host's, ns; force in N and torque in N m."""
 
 
 class UrWrench:
     """The wrench of an arm; a `ForceSensor` of `rigs.core.capabilities`.
 
     Raises:
-        RigError: the rig's arm is of another driver.
+        RigError: the rig's arm is of another driver, or was not built to send its wrench.
     """
 
     mounting = Mounting(axes="base", feels="arm")
@@ -37,13 +31,10 @@ class UrWrench:
     def __init__(self, settings: UrWrenchSettings, arm: Arm) -> None:
         if not isinstance(arm, UrArm):
             raise RigError(DEVICE, "ur_wrench needs the arm of driver: ur")
-        self._arm = arm
+        if arm.wrenches is None:
+            raise RigError(DEVICE, "the arm was built without its wrench")
+        self._arm, self._log = arm, arm.wrenches
         self.zeroing = settings.bias
-        self._rows: deque[Row] = deque(maxlen=BACKLOG_SAMPLES)
-        self._lock = threading.Lock()
-        self._streaming = False
-        self._dropped = 0
-        arm.on_wrench = self._take
 
     def connect(self) -> None:
         """See that the arm is connected.
@@ -57,10 +48,7 @@ class UrWrench:
 
     def start(self) -> None:
         """Begin to keep samples."""
-        with self._lock:
-            self._rows.clear()
-            self._dropped = 0
-        self._streaming = True
+        self._log.start()
 
     def read(self) -> WrenchChunk:
         """Samples since the last call.
@@ -68,10 +56,8 @@ class UrWrench:
         Raises:
             RigError: the arm's stream has ended.
         """
-        with self._lock:
-            rows = list(self._rows)
-            self._rows.clear()
-        if self._streaming:
+        rows = self._log.read()
+        if self._log.streaming:
             self._check()
         if not rows:
             return WrenchChunk.empty()
@@ -89,7 +75,7 @@ class UrWrench:
 
     def stop(self) -> None:
         """Store no more samples; those received can still be read."""
-        self._streaming = False
+        self._log.stop()
 
     def close(self) -> None:
         """Nothing to give back: the connection is the arm's."""
@@ -97,15 +83,8 @@ class UrWrench:
 
     def describe(self) -> Json:
         """Samples that were not read in time."""
-        return {"dropped": self._dropped}
+        return {"dropped": self._log.dropped}
 
     def _check(self) -> None:
         if self._arm.state() is ArmState.DISCONNECTED:
             raise RigError(DEVICE, "the arm that measures it is not connected")
-
-    def _take(self, t_ns: int, host_ns: int, values: tuple[float, ...]) -> None:
-        """In the thread of the arm's stream."""
-        if self._streaming:
-            with self._lock:
-                self._dropped += len(self._rows) == BACKLOG_SAMPLES
-                self._rows.append((t_ns, host_ns, values))

@@ -126,7 +126,6 @@ class FedCamera(UvcCamera):
         self._pipe = VideoPipe(settings.width_px, settings.height_px, settings.rate_hz)
         self._shown = 0
         self._ended = threading.Event()
-        scene.on_frames = self._show
         try:
             super().__init__(settings.model_copy(update={"device": self._pipe.path}), px_per_mm)
         except BaseException:
@@ -138,7 +137,7 @@ class FedCamera(UvcCamera):
         super().start()
         self._shown = 0
         self._ended.clear()
-        self._scene.grab(*self._size)
+        self._scene.grab(*self._size, self._show)
 
     def stop(self) -> None:
         """Stop the scene, let its last frames pass, and stop the driver."""

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors import detectors
+from sliplab.analysis.detectors import detectors, network_detector
 from sliplab.analysis.detectors import live as lives
 from sliplab.analysis.detectors.detectors import (
     Cusum,
@@ -21,6 +21,7 @@ from sliplab.analysis.detectors.detectors import (
     Tuned,
 )
 from sliplab.analysis.detectors.live import FreshestArrival, LiveDecision, LiveDetector
+from sliplab.analysis.detectors.network_detector import NetworkDetector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.windows import bin_events
@@ -58,8 +59,19 @@ class Network:
         return np.stack([(flat * weights**k).sum(axis=1) % 7 for k in (0, 1, 2)], axis=1)
 
 
-def detector(network: Network, rule: Detection | None = None, **options: object) -> LiveDetector:
-    return LiveDetector(network, TINY, rule or Detection(smoothing=2), **SIZE, **options)  # type: ignore[arg-type]  # options go by name
+def detector(
+    network: Network,
+    rule: Detection | None = None,
+    stride_us: int | None = None,
+    **options: int,
+) -> LiveDetector:
+    windows = NetworkDetector(network, TINY, rule or Detection(smoothing=2), stride_us=stride_us)
+    return LiveDetector(windows, **SIZE, **options)
+
+
+def open_windows(live: LiveDetector) -> int:
+    assert isinstance(live._detector, NetworkDetector)
+    return live._detector.open_windows
 
 
 def events(t_us: list[int] | npt.NDArray[np.int64], seed: int = 0) -> EventChunk:
@@ -100,7 +112,7 @@ def test_a_stream_cut_anywhere_gives_what_the_whole_gives(
         made += live.push(part(chunk, slice(begin, end)))
         if begin < end:
             made += live.advance(int(chunk.t_us[end - 1]))
-        assert live.open_windows <= 1
+        assert open_windows(live) <= 1
     last_us = int(chunk.t_us[-1])
     made += live.advance(last_us + LENGTH_US)
 
@@ -133,7 +145,7 @@ def test_the_rule_step_by_step_is_the_rule(
     counts = np.array(rows, np.int64).reshape(-1, 3)
     ends = 30 * np.arange(1, len(counts) + 1, dtype=np.int64)
     whole = detect(counts, ends, rule)
-    running = lives.RunningRule(rule)
+    running = network_detector.RunningRule(rule)
     said = [running.step(row) for row in counts]
     assert [step.valid_class for step in said] == whole.valid_class.tolist()
     assert [step.smoothed for step in said] == [tuple(row) for row in whole.smoothed.tolist()]
@@ -161,7 +173,7 @@ def test_a_detector_step_by_step_decides_as_on_the_whole(
     seen = Predictions(counts, counts.sum(axis=1), np.arange(len(rows)))
     levels = Levels(level, level / 2)
     expected = detectors.decide(detector.evidence(seen), levels)
-    running = lives.RunningRule(Tuned("", detector, levels))
+    running = network_detector.RunningRule(Tuned("", detector, levels))
     steps = [running.step(row, int(row.sum())) for row in counts]
     found = [next((k for k, it in enumerate(steps) if it.onset == name), None) for name in CLASSES]
     assert found == [None, expected.incipient_ns, expected.gross_ns]
@@ -176,7 +188,7 @@ def test_a_detector_begins_anew_after_a_gap() -> None:
     assert ratio > 0
     level = 1.5 * ratio
     for gap, onset in ((False, "incipient"), (True, None)):
-        running = lives.RunningRule(Tuned("", Cusum(READING), Levels(level, level)))
+        running = network_detector.RunningRule(Tuned("", Cusum(READING), Levels(level, level)))
         assert running.step(ROW[0], 0).onset is None
         if gap:
             running.interrupt()
@@ -192,7 +204,7 @@ def test_windows_that_overlap(steps: list[int], cut: list[int], stride_us: int) 
     edges = [0, *sorted(min(place, len(chunk)) for place in cut), len(chunk)]
     for begin, end in itertools.pairwise(edges):
         live.push(part(chunk, slice(begin, end)))
-        assert live.open_windows <= -(-LENGTH_US // stride_us)
+        assert open_windows(live) <= -(-LENGTH_US // stride_us)
     last_us = int(chunk.t_us[-1])
     live.advance(last_us + LENGTH_US)
     starts = np.arange(int(chunk.t_us[0]), last_us + 1, stride_us)
@@ -218,10 +230,10 @@ def test_a_quiet_scene_is_judged_by_the_clock() -> None:
 def test_out_of_order_counts_where_it_belongs_while_its_window_is_open() -> None:
     chunk = events(np.arange(100, 3900, 100))
     straight, mixed = Network(), Network()
-    live = detector(straight, starts=lambda number: number * LENGTH_US)
+    live = detector(straight, origin_us=0)
     live.push(chunk)
     live.advance(LENGTH_US)
-    other = detector(mixed, starts=lambda number: number * LENGTH_US)
+    other = detector(mixed, origin_us=0)
     order = np.random.default_rng(1).permutation(len(chunk))
     other.push(part(chunk, order[:20]))
     other.push(part(chunk, order[20:]))
@@ -233,7 +245,7 @@ def test_out_of_order_counts_where_it_belongs_while_its_window_is_open() -> None
 
 def test_an_event_that_comes_too_late_is_left_out_and_counted() -> None:
     network = Network()
-    live = detector(network, starts=lambda number: number * LENGTH_US)
+    live = detector(network, origin_us=0)
     live.push(events([100, 4100]))
     assert live.push(events([3999, 4200])) == []
     (made,) = live.advance(2 * LENGTH_US)
@@ -278,13 +290,13 @@ def test_counts_stop_at_255_whatever_the_pieces() -> None:
 
 def test_what_is_wrong_is_refused() -> None:
     with pytest.raises(ValueError, match="larger than the sensor"):
-        LiveDetector(Network(), TINY, Detection(), width=30, height=50)
+        LiveDetector(NetworkDetector(Network(), TINY, Detection()), width=30, height=50)
     with pytest.raises(ValueError, match="positive"):
         detector(Network(), stride_us=0)
     with pytest.raises(ValueError, match="outside 60 x 50"):
         detector(Network()).push(EventChunk(*(np.array([value]) for value in (60, 0, 1, 0))))
     with pytest.raises(ValueError, match="expected integers"):
-        lives.RunningRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
+        network_detector.RunningRule(Detection()).step(np.zeros(3))  # type: ignore[arg-type]  # that is the point
 
 
 @given(st.lists(st.integers(0, 5000), min_size=1, max_size=40), st.integers(-(10**12), 10**12))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from sliplab.analysis.detectors.live import counting_of
+from sliplab.analysis.detectors.network_detector import counting_of
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.model_file import FORMAT, load, save

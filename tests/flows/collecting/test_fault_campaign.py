@@ -18,8 +18,8 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.labelling import Labelling
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.faults import KINDS
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.mock.fault_kinds import KINDS
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify

@@ -98,48 +98,56 @@ class Case:
 
 
 CASES = [
-    Case("arm", "protective stop", "protective stop", "unlock the stop at the pendant", 0.05),
+    Case("arm", "arm_protective_stop", "protective stop", "unlock the stop at the pendant", 0.05),
     Case(
         "arm",
-        "link cut",
+        "device_gone",
         "may still move: check power and network",
         "its own watchdog ends a move after 1 s",
         1 / WATCHDOG_HZ,
     ),
     Case(
         "arm",
-        "silence",
+        "device_silent",
         "may still move: check power and network",
         "its own watchdog ends a move after 1 s",
         1 / WATCHDOG_HZ,
     ),
     Case(
         "frame_camera",
-        "unplug",
+        "device_gone",
         "frame camera: the camera was unplugged",
         "plug it in",
         0.1 + POLL_S + STOP_S,
     ),
     Case(
         "event_camera",
-        "stall",
+        "event_stall",
         "event camera: sent no event and no pulse",
         "check cable",
         1.0 + POLL_S + STOP_S,
     ),
     Case(
         "event_camera",
-        "unplug",
+        "device_gone",
         "event camera: the connection is lost",
         "check its cable",
         POLL_S + STOP_S,
     ),
-    Case("sync_box", "reset", "sync box: .*restarted", "start the trial again", POLL_S + STOP_S),
-    Case("sync_box", "unplug", "sync box: the connection broke", "Plug it in", POLL_S + STOP_S),
+    Case(
+        "sync_box",
+        "clock_restart",
+        "sync box: .*restarted",
+        "start the trial again",
+        POLL_S + STOP_S,
+    ),
+    Case(
+        "sync_box", "device_gone", "sync box: the connection broke", "Plug it in", POLL_S + STOP_S
+    ),
 ]
 
 
-FIRST = {("arm", "protective stop"), ("arm", "link cut"), ("sync_box", "unplug")}
+FIRST = {("arm", "arm_protective_stop"), ("arm", "device_gone"), ("sync_box", "device_gone")}
 """Tried every time; a further event camera is unplugged in test_loopback_streams.py."""
 
 
@@ -191,7 +199,7 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
     assert str(raised.value) in failed["cause"]
     kept = read_json(campaign.folder / "quarantine" / failed["folder"] / "cause.json")
     assert kept["cause"] == f"{type(raised.value).__name__}: {raised.value}"
-    if case.kind == "protective stop":
+    if case.kind == "arm_protective_stop":
         nobody_unlocks_it(run_request, stage)
     put_right(stage, case.device)
     with at_work(run_request, stage) as (work, campaign):

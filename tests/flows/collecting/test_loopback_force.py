@@ -101,7 +101,7 @@ def agree(live: Recording, run_request: RunRequest, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "said"),
-    [("silence", "nothing came for"), ("overload", "force or torque out of range")],
+    [("device_silent", "nothing came for"), ("force_overload", "force or torque out of range")],
 )
 def test_a_sensor_at_fault_stops_the_arm_first(
     run_request: RunRequest, tmp_path: Path, kind: str, said: str

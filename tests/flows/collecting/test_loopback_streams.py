@@ -78,7 +78,7 @@ def test_a_second_camera_that_is_unplugged_stops_the_arm(tmp_path: Path) -> None
             right_mm = stage.arm_place()[0]
             if right_mm > 1.0 and not unplugged:
                 unplugged.append(right_mm)
-                stage.inject("side", "unplug")
+                stage.inject("side", "device_gone")
             return False
 
         work.rig.should_stop = unplug_once_it_slides

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.live import Counting
+from sliplab.analysis.detectors.detector import StreamDetector
+from sliplab.analysis.detectors.network_detector import Counting
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
+from sliplab.flows.detect import BuildRig
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
+from sliplab.flows.detecting.sources import NetworkSource
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
@@ -44,6 +46,12 @@ def model_in(folder: Path, outputs: int = 4) -> Path:
     return path
 
 
+def scripted(order: DetectRequest, counting: Counting) -> StreamDetector:
+    """The network detector of a request, with another network."""
+    assert isinstance(order.source, NetworkSource)
+    return order.source.detector(counting)
+
+
 def slip_when_busy(most: int = MANY) -> Counting:
     """Says incipient slip in a window with more than so many counts, no slip otherwise."""
 
@@ -64,11 +72,11 @@ def ordered(model: Path, protocol: Path, **options: Any) -> DetectRequest:
     return make_detect_request(RIG, model, protocol=protocol, trial="", **options)
 
 
-def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:
+def keeping(rigs: list[Rig]) -> BuildRig:
     """Builds rigs and keeps them to be looked at."""
 
-    def build(file: RigFile) -> Rig:
-        rigs.append(build_rig(file))
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rigs.append(build_rig(file, should_stop))
         return rigs[-1]
 
     return build

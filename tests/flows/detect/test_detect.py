@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.live import LiveDetector, counting_of
+from sliplab.analysis.detectors.live import LiveDetector
+from sliplab.analysis.detectors.network_detector import NetworkDetector, counting_of
 from sliplab.analysis.detectors.smoothing_rule import detect as detect_trial
 from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
@@ -21,7 +22,7 @@ from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.detection import Detection
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
@@ -30,7 +31,14 @@ from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detect import detecting
-from tests.flows.detect.detecting import RIG, keeping, ordered, slip_when_busy, stands_clear
+from tests.flows.detect.detecting import (
+    RIG,
+    keeping,
+    ordered,
+    scripted,
+    slip_when_busy,
+    stands_clear,
+)
 from tests.flows.live import request_in, take_all
 
 
@@ -54,7 +62,7 @@ def test_the_margin_is_in_spikes_of_the_model(outputs: int, margin: float, tmp_p
     listening = make_detect_request(RIG, model, seconds=1.0)
     trial = "depth=2.4mm,speed=1.6mmps,direction=0deg"
     moving = make_detect_request(RIG, model, protocol=pilot, trial=trial)
-    assert listening.detection.margin == moving.detection.margin == margin
+    assert listening.source.detection.margin == moving.source.detection.margin == margin
 
 
 # -- the same windows and decisions as offline -----------------------------------------------
@@ -77,12 +85,13 @@ def test_a_stored_trial_gives_the_offline_windows_and_decisions(stored: Recordin
         seen.append(window)
         return network(window)
 
-    live = LiveDetector(
+    detector = NetworkDetector(
         counting,
         fitted.windows,
         rule,
         starts=lambda number: starts_us[number] if number < len(starts_us) else 1 << 60,
     )
+    live = LiveDetector(detector, origin_us=0)
     events = stored.events()
     made = []
     for begin in range(0, len(events), 997):
@@ -135,7 +144,7 @@ def test_a_stop_keeps_the_arm_where_it_is_and_then_leaves_straight_out(
 ) -> None:
     rigs: list[Rig] = []
     order = ordered(model, protocol, reflex="stop", hold_s=0.3)
-    result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
+    result = detect(order, detector=scripted(order, slip_when_busy()), build=keeping(rigs))
     reflex = result["reflex"]
     assert reflex["done"]
     assert reflex["phase"] == "slide"
@@ -150,7 +159,9 @@ def test_a_stop_keeps_the_arm_where_it_is_and_then_leaves_straight_out(
 def test_pressing_on_goes_as_deep_as_was_said(model: Path, protocol: Path) -> None:
     rigs: list[Rig] = []
     order = ordered(model, protocol, reflex="press:0.5", hold_s=0.1)
-    reflex = detect(order, counting=slip_when_busy(), build=keeping(rigs))["reflex"]
+    reflex = detect(order, detector=scripted(order, slip_when_busy()), build=keeping(rigs))[
+        "reflex"
+    ]
     assert reflex["depth_mm"] == pytest.approx(2.9, abs=0.01)
     assert reflex["stopped_mm"][2] == pytest.approx(2.4, abs=0.01)
     assert stands_clear(rigs[0])
@@ -163,7 +174,7 @@ def test_no_reflex_goes_deeper_than_the_limit(model: Path, protocol: Path) -> No
     assert order.reflex is not None
     # where the arm stands deeper than it was told to, the limit still holds
     deeper = replace(order, reflex=replace(order.reflex, deepest_mm=3.0))
-    reflex = detect(deeper, counting=slip_when_busy())["reflex"]
+    reflex = detect(deeper, detector=scripted(deeper, slip_when_busy()))["reflex"]
     assert reflex["depth_mm"] == pytest.approx(3.0, abs=0.01)
 
 
@@ -179,8 +190,8 @@ def test_a_reflex_that_fails_stops_the_arm(
             raise RigError("arm", "does not want to")
         return move(rig, step, *rest)
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         stop = rig.arm.stop
         monkeypatch.setattr(rig.arm, "stop", lambda: (stopped.append(1), stop())[1])
         return rig
@@ -188,14 +199,14 @@ def test_a_reflex_that_fails_stops_the_arm(
     monkeypatch.setattr(Rig, "move", failing)
     order = ordered(model, protocol, reflex="press:0.5")
     with pytest.raises(RigError, match="does not want to"):
-        detect(order, counting=slip_when_busy(), build=build)
+        detect(order, detector=scripted(order, slip_when_busy()), build=build)
     assert len(stopped) >= 2  # by the reflex, and because it failed
     assert stands_clear(rigs[0])
 
 
 def test_a_false_alarm_in_the_hold_moves_nothing(model: Path, protocol: Path) -> None:
     order = ordered(model, protocol, reflex="stop")
-    result = detect(order, counting=slip_when_busy(-1), build=keeping([]))
+    result = detect(order, detector=scripted(order, slip_when_busy(-1)), build=keeping([]))
     # slip is said of every window, so the first in the slide calls for it, and none before
     assert result["onsets"]["incipient"]["phase"] == "hold"
     assert result["reflex"]["phase"] == "slide"
@@ -212,8 +223,8 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     rigs: list[Rig] = []
     truth: list[dict[str, Any]] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         take_step, begun = rig.take_step, [0]
 
         def looking(index: int, step: Any, *rest: Any) -> Any:
@@ -227,10 +238,12 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
         monkeypatch.setattr(rig, "take_step", looking)
         return rig
 
-    result = detect(order, counting=slip_when_busy(80), build=build)
+    result = detect(order, detector=scripted(order, slip_when_busy(80)), build=build)
     assert result["reflex"]["phase"] == "retract"
     assert [found["gross_ns"] for found in truth] == [None]  # the plate never fell
-    watched = detect(replace(order, reflex=None), counting=slip_when_busy(80), build=build)
+    watched = detect(
+        replace(order, reflex=None), detector=scripted(order, slip_when_busy(80)), build=build
+    )
     assert watched["reflex"] is None
     assert truth[1]["gross_ns"] is not None
     assert result["reflex"]["stopped_mm"][2] < 3.4

@@ -15,13 +15,21 @@ from rich.console import Console
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import choose_trial, make_detect_request
 from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
-from tests.flows.detect.detecting import RIG, keeping, ordered, slip_when_busy, stands_clear
+from tests.flows.detect.detecting import (
+    RIG,
+    keeping,
+    ordered,
+    scripted,
+    slip_when_busy,
+    stands_clear,
+)
 
 # -- how it ends -----------------------------------------------------------------------------
 
@@ -38,8 +46,9 @@ def test_a_stop_request_stops_the_arm(
 
     # as the handler of Ctrl-C does, in the middle of the slide
     monkeypatch.setattr("sliplab.flows.running.stopping.requested", lambda: len(asked) > 25)
+    order = ordered(model, protocol)
     with pytest.raises(StopRequested):
-        detect(ordered(model, protocol), counting=counting, build=keeping(rigs))
+        detect(order, detector=scripted(order, counting), build=keeping(rigs))
     assert stands_clear(rigs[0])
     assert len(asked) < 30
 
@@ -49,8 +58,8 @@ def test_a_camera_whose_clock_falls_back_ends_it(
 ) -> None:
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         read, count = rig.events.read, iter(range(1000))
 
         def fallen() -> Any:
@@ -61,8 +70,9 @@ def test_a_camera_whose_clock_falls_back_ends_it(
         monkeypatch.setattr(rig.events, "read", fallen)
         return rig
 
+    order = ordered(model, protocol)
     with pytest.raises(RigError, match=r"event camera: .*fell back"):
-        detect(ordered(model, protocol), counting=slip_when_busy(), build=build)
+        detect(order, detector=scripted(order, slip_when_busy()), build=build)
     assert stands_clear(rigs[0])
 
 
@@ -71,7 +81,7 @@ def test_listening_moves_nothing_and_judges_silence(model: Path, tmp_path: Path)
     silent = {"extends": str(RIG), "name": "silent", "mock": quiet}
     order = make_detect_request(write(tmp_path / "r.yaml", silent), model, seconds=1.5)
     rigs: list[Rig] = []
-    result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
+    result = detect(order, detector=scripted(order, slip_when_busy()), build=keeping(rigs))
     assert result["trial"] is None
     assert result["events"] == 0
     # pulses tell the time; the last 200 ms are left open
@@ -88,7 +98,8 @@ def test_listening_ends_when_somebody_asks(model: Path, monkeypatch: pytest.Monk
         return np.array([[9, 0, 0]])
 
     monkeypatch.setattr("sliplab.flows.running.stopping.requested", lambda: len(asked) > 5)
-    result = detect(make_detect_request(RIG, model, seconds=60), counting=counting)
+    order = make_detect_request(RIG, model, seconds=60)
+    result = detect(order, detector=scripted(order, counting))
     assert result["interrupted"] is True
     assert result["windows"] < 10
 
@@ -99,7 +110,8 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
     shown = io.StringIO()
     terminal = Console(file=shown, force_terminal=True, width=100, height=30)
     monkeypatch.setattr("sliplab.flows.running.console.messages", terminal)
-    detect(make_detect_request(RIG, model, seconds=0.6), counting=slip_when_busy())
+    order = make_detect_request(RIG, model, seconds=0.6)
+    detect(order, detector=scripted(order, slip_when_busy()))
     text = shown.getvalue()
     for part in ("simulated listening", "no slip", "9.00", "events/s", "gross"):
         assert part in text

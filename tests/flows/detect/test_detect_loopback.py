@@ -8,12 +8,13 @@ import pytest
 
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
-from tests.flows.detect.detecting import model_in, short_slide, slip_when_busy
+from tests.flows.detect.detecting import model_in, scripted, short_slide, slip_when_busy
 from tests.flows.live import rig_yaml, stage_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
@@ -33,10 +34,10 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     )
     with stage_of(order.rig) as stage:
 
-        def build(file: RigFile) -> Rig:
-            return loopback_rig(file, stage)
+        def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+            return loopback_rig(file, stage, should_stop)
 
-        result = detect(order, counting=slip_when_busy(), build=build)
+        result = detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.arm_place()[2] < 0
     assert result["simulated"] is True
     assert result["virtual_time"] is False
@@ -73,18 +74,18 @@ def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path:
     )
     with stage_of(order.rig) as stage:
 
-        def build(file: RigFile) -> Rig:
-            return loopback_rig(file, stage)
+        def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+            return loopback_rig(file, stage, should_stop)
 
-        reflex = detect(order, counting=slip_when_busy(), build=build)["reflex"]
+        reflex = detect(order, detector=scripted(order, slip_when_busy()), build=build)["reflex"]
         assert stage.arm_place()[2] < 0
         assert reflex
         # three steps of 1/3 mm are 1 mm, and the driver rounds to the wider opening
         assert reflex["closed_mm"] == pytest.approx(1.0, abs=0.34)
         assert reflex["depth_mm"] == pytest.approx(2.4 + reflex["closed_mm"], abs=0.05)
         assert not reflex["stalled"]
-        stage.inject("gripper", "silence")
+        stage.inject("gripper", "device_silent")
         with pytest.raises(RigError, match="gripper: no answer"):
-            detect(order, counting=slip_when_busy(), build=build)
+            detect(order, detector=scripted(order, slip_when_busy()), build=build)
         assert stage.at_rest()
     print(f"simulated: {reflex}")

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.live import Counting
+from sliplab.analysis.detectors.network_detector import Counting
 from sliplab.flows.detect import detect
-from sliplab.flows.detecting.network_process import NetworkLost, NetworkProcess
+from sliplab.flows.detecting.detector_process import NetworkLost, NetworkProcess
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.protocols import InputError
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import SafeState
 from sliplab.rigs.core.rig import Rig
@@ -26,7 +27,7 @@ from sliplab.storage.streams import EventChunk
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
-from tests.flows.detect.detecting import keeping, slip_when_busy, stands_clear, untrained
+from tests.flows.detect.detecting import keeping, scripted, slip_when_busy, stands_clear, untrained
 
 RIG = ROOT / "rigs" / "mock_gripper.yaml"
 STREAM_MS, DECISION_MS = 200.0, 100.0
@@ -64,13 +65,13 @@ def safe_state(
     """Run until the safe state, and return it and the rig."""
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         disturb(rig)
         return rig
 
     with pytest.raises(SafeState) as found:
-        detect(order, counting=counting, build=build)
+        detect(order, detector=scripted(order, counting), build=build)
     return found.value, rigs[0]
 
 
@@ -200,7 +201,7 @@ def test_without_a_safe_state_a_failure_moves_the_arm_clear(gripping: Gripping) 
     order = gripping(mock=gone("event_camera", 1.0), reflex=None)
     rigs: list[Rig] = []
     with pytest.raises(RigError, match="event camera") as found:
-        detect(order, counting=quiet, build=keeping(rigs))
+        detect(order, detector=scripted(order, quiet), build=keeping(rigs))
     assert not isinstance(found.value, SafeState)
     assert stands_clear(rigs[0])
 
@@ -213,8 +214,8 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
     """With a safe state the arm stays; without one it moves clear, as after any failure."""
     rigs: list[Rig] = []
 
-    def build(file: RigFile) -> Rig:
-        rig = keeping(rigs)(file)
+    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
+        rig = keeping(rigs)(file, should_stop)
         read, pulses = rig.events.read, rig.events.read_pulses
 
         def lost() -> bool:
@@ -243,7 +244,7 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
     expected = SafeState if stays else RigError
     said = "event camera: neither events nor pulses|event camera: .*clock|fell back"
     with pytest.raises(expected, match=said):
-        detect(order, counting=quiet, build=build)
+        detect(order, detector=scripted(order, quiet), build=build)
     assert rigs[0].arm.progress().done
     assert (rigs[0].position().depth_mm < 0) != stays
 
@@ -268,7 +269,7 @@ def test_the_command_says_what_was_lost_and_fails(
 def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(gripping: Gripping) -> None:
     rigs: list[Rig] = []
     order = gripping()
-    result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
+    result = detect(order, detector=scripted(order, slip_when_busy()), build=keeping(rigs))
     reflex = result["reflex"]
     assert (reflex["done"], reflex["stalled"]) == (True, False)
     assert reflex["stopped_mm"][2] == pytest.approx(2.4, abs=0.01)
@@ -291,7 +292,7 @@ def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(gripping: Gripping) -
 def test_a_grip_stalls_at_the_force_of_the_rig_file(gripping: Gripping) -> None:
     weak = {"mock": {"gripper": {"force_n": [2.0, 50.0]}}, "reflex": {"force": "2 N"}}
     order = gripping("grip:1", **weak)
-    reflex = detect(order, counting=slip_when_busy())["reflex"]
+    reflex = detect(order, detector=scripted(order, slip_when_busy()))["reflex"]
     assert reflex["stalled"]
     assert 0.0 < reflex["closed_mm"] < 0.5
 
@@ -338,7 +339,7 @@ def test_limits_of_force_hold_for_grips(gripping: Gripping) -> None:
 
 
 def test_the_network_in_its_process_is_the_network(model: Path) -> None:
-    from sliplab.analysis.detectors.live import counting_of
+    from sliplab.analysis.detectors.network_detector import counting_of
 
     windows = untrained().windows
     shape = (1, windows.steps, windows.channels, windows.cells, windows.cells)

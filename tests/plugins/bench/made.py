@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
+from sliplab.analysis.detectors.feeding import feed
 from sliplab.plugins.bench.alarms import SceneEvidence
 from sliplab.plugins.bench.document import BenchDetector
-from sliplab.plugins.bench.feeding import feed
 from sliplab.plugins.bench.figures import RATES, tested, validated
-from sliplab.plugins.bench.interface import Detector, Evidence, Scene, Slip
 from sliplab.storage.streams import EventChunk
 
 SLIP_HZ = 2000

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sliplab.analysis.detectors.detector import Evidence, Slip
 from sliplab.plugins.bench.alarms import SceneEvidence, alarm_times, level_at, outcome
 from sliplab.plugins.bench.figures import accuracy, disturbed_rate, scores
-from sliplab.plugins.bench.interface import Evidence, Slip
 
 SLIP = Slip(5_000_000, 5_100_000, 8_000_000)
 

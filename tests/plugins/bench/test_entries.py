@@ -12,19 +12,21 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
+from sliplab.analysis.detectors.detector import DetectorError, Scene
 from sliplab.analysis.detectors.detectors import Predictions
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.registry import contents, make_detector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import INCIPIENT
 from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.plugins.bench import PLUGIN
+from sliplab.plugins.bench.audit import audit
 from sliplab.plugins.bench.entries.hyperdimensional import Hyperdimensional
 from sliplab.plugins.bench.entries.network import PaperEntry
 from sliplab.plugins.bench.entries.onnx_model import OnnxModel
 from sliplab.plugins.bench.entries.program import ANSWER, MOST, ExternalProcess
 from sliplab.plugins.bench.entries.thresholds import Fall, motions
 from sliplab.plugins.bench.entries.trivial import Random
-from sliplab.plugins.bench.feeding import BenchError, audit, feed
-from sliplab.plugins.bench.interface import Scene
-from sliplab.plugins.bench.registry import SHIPPED, contents, make_detector
 from sliplab.plugins.bench.windowed import MeanOdds
 from sliplab.protocols.errors import InputError
 from tests.conftest import ROOT
@@ -71,7 +73,7 @@ def test_a_program_that_fails_is_ended_and_says_why(
 ) -> None:
     answer_s = 0.5 if "sleep" in text else 30.0  # it takes a while to start
     detector = ExternalProcess(program(tmp_path, text), answer_s=answer_s, end_s=0.5)
-    with pytest.raises(BenchError, match=said):
+    with pytest.raises(DetectorError, match=said):
         feed(detector, one)
     detector.close()
     assert detector._process.poll() is not None
@@ -80,7 +82,7 @@ def test_a_program_that_fails_is_ended_and_says_why(
 def test_a_program_that_writes_before_it_reads_blocks_nobody(one: Scene, tmp_path: Path) -> None:
     text = "import sys; sys.stdout.buffer.write(bytes(10**6)); sys.stdout.flush(); sys.stdin.read()"
     detector = ExternalProcess(program(tmp_path, text), answer_s=30.0, end_s=0.5)
-    with pytest.raises(BenchError, match="answered"):
+    with pytest.raises(DetectorError, match="answered"):
         feed(detector, one)
     detector.close()
 
@@ -104,7 +106,7 @@ def test_a_program_whose_evidence_is_no_number_is_refused(
 ) -> None:
     text = ANSWERS.format(before="", value=value)
     detector = ExternalProcess(program(tmp_path, text), answer_s=30.0)
-    with pytest.raises(BenchError, match="must be finite or -inf"):
+    with pytest.raises(DetectorError, match="must be finite or -inf"):
         feed(detector, one)
     detector.close()
 
@@ -149,7 +151,7 @@ def test_a_program_that_floods_its_output_is_bounded(
     text: str, said: str, one: Scene, tmp_path: Path
 ) -> None:
     detector = ExternalProcess(program(tmp_path, text), answer_s=2.0, end_s=0.2)
-    with pytest.raises(BenchError, match=said):
+    with pytest.raises(DetectorError, match=said):
         feed(detector, one)
     assert len(detector._read) <= MOST * ANSWER.itemsize + (1 << 17)
     assert len(detector._last_errors) <= 1 << 16
@@ -252,7 +254,7 @@ def test_what_a_name_means_is_hashed(tmp_path: Path) -> None:
 
 
 def test_shipped_detectors_can_be_made() -> None:
-    for name in SHIPPED:
+    for name in PLUGIN.detectors:
         make_detector(name).begin(640, 480)
 
 

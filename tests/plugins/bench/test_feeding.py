@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.plugins.bench.feeding import BenchError, audit, feed
-from sliplab.plugins.bench.interface import Detector, Evidence, Scene
+from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.plugins.bench.audit import audit
 from sliplab.storage.streams import EventChunk
 from tests.plugins.bench.made import Counting, scene
 
@@ -45,7 +46,7 @@ class Answering(Detector):
     ],
 )
 def test_evidence_that_is_none_is_refused(detector: Detector, said: str, one: Scene) -> None:
-    with pytest.raises(BenchError, match=said):
+    with pytest.raises(DetectorError, match=said):
         feed(detector, one)
 
 
@@ -58,7 +59,7 @@ def test_evidence_depends_on_earlier_events_alone(one: Scene) -> None:
             return Evidence.of(found.t_us, np.full(len(found), len(events)))
 
     assert len(audit(Counting(), one).evidence) == one.end_us // 10_000
-    with pytest.raises(BenchError, match="must depend on earlier events alone"):
+    with pytest.raises(DetectorError, match="must depend on earlier events alone"):
         audit(LooksAhead(), one)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.analysis.detectors.detector import Scene
 from sliplab.plugins.bench import run, scenes
 from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
 from sliplab.plugins.bench.document import BenchResult
 from sliplab.plugins.bench.entries.thresholds import EventRate
-from sliplab.plugins.bench.interface import Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
 from tests.command_line import here

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sliplab.analysis.detectors.detector import Scene
 from sliplab.plugins.bench import definition, scenes
 from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
-from sliplab.plugins.bench.interface import Scene
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.hashing import hash_data
 

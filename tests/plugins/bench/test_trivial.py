@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from sliplab.analysis.detectors.detector import Detector, Evidence, Scene
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.plugins.bench.document import BenchDetector, MedianLatency
 from sliplab.plugins.bench.entries.trivial import Always, Blind, ByTheClock, Never, Random
 from sliplab.plugins.bench.figures import ranked
-from sliplab.plugins.bench.interface import Detector, Evidence, Scene
 from sliplab.storage.streams import EventChunk
 from tests.plugins.bench.made import Counting, row_of, some_scenes
 

@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.detectors.detectors import Tuned
-from sliplab.analysis.detectors.live import counting_of
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.registry import make_detector
+from sliplab.analysis.detectors.stored_scenes import scenes
+from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.study import Finding
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome
@@ -20,6 +24,7 @@ from sliplab.plugins.reflex.rows import reflex_rows
 from sliplab.plugins.reflex.study import STUDY
 from sliplab.protocols import InputError
 from sliplab.protocols.detection import Detection
+from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -53,7 +58,9 @@ def test_who_cries_always_or_never_is_at_the_bottom(
     for detector, counting in countings.items():
         for case in asked.cases:
             if case.reflex is not None:
-                made = flow.measure(asked, case, {name: counting})
+                made = flow.measure(
+                    asked, case, {name: asked.requests[name].source.detector(counting)}
+                )
                 trials.append(made.model_copy(update={"detector": detector}))
     rows = {(row.detector, row.reflex): row for row in reflex_rows(trials)}
     assert rows[None, None].dropped == 1
@@ -102,12 +109,12 @@ def test_a_store_has_all_its_detectors(
     rule, tuned = "network", "cusum counts"
     asked = flow.request(place, RIG, tmp_path, fast, ("stop",), detectors=[rule, tuned])
     assert [it.detector for it in asked.cases] == [None, rule, tuned]
-    assert isinstance(asked.requests[rule].detection, Detection)
-    found = asked.requests[tuned]
+    assert isinstance(asked.requests[rule].source.detection, Detection)
+    found = asked.requests[tuned].source
     assert isinstance(found.detection, Tuned)
     assert found.stride_ms == 10
-    counting = counting_of(found.fitted)
-    made = [flow.measure(asked, case, {tuned: counting}) for case in asked.cases[::2]]
+    detectors = {tuned: found.detector()}
+    made = [flow.measure(asked, case, detectors) for case in asked.cases[::2]]
     assert made[0].detected_ms is None
     assert made[1].detected_ms is not None
     with pytest.raises(InputError, match="must be one of network, paper, smoothing, "):
@@ -135,6 +142,25 @@ def test_a_store_detects_by_any_of_its_detectors(
         done = here(*asked, *options)
         assert done.returncode == 2
         assert right in json.loads(done.stdout)["error"]["message"]
+
+
+def test_a_detector_of_the_bench_is_set_by_the_store_and_reacts(
+    ran: tuple[list[RunRequest], StudyOutcome], fast: Path, tmp_path: Path
+) -> None:
+    place = ran[0][0].store
+    asked = flow.request(place, RIG, tmp_path, fast, ("stop",), detectors=["network", "rate"])
+    assert [it.detector for it in asked.cases] == [None, "network", "rate"]
+    assert len({it.key for it in asked.cases}) == 3
+    fitted = asked.requests["rate"].source.detector()
+    validation = scenes(StoreLabels(Store(place)), collected(Store(place)), "validation")
+    for one in validation:  # as many as are allowed, none of so few, are false early
+        found = feed(make_detector("rate"), one)
+        early = found.t_us < one.slip.paper_us - 30_000
+        assert found.value[early].max() <= fitted.level
+    made = flow.measure(asked, asked.cases[-1], {"rate": fitted})
+    assert made.detector == "rate"
+    with pytest.raises(InputError, match="did you mean 'rate'"):
+        flow.request(place, RIG, tmp_path, fast, detectors=["rat"])
 
 
 def test_the_command(model: Path, fast: Path, tmp_path: Path) -> None:

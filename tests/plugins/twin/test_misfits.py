@@ -39,7 +39,7 @@ from sliplab.plugins.twin.pilot import PilotTrial, SlideEvents, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.plugins.twin.trends import LAG, PULL
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.fault_kinds import PapillaTorn
+from sliplab.rigs.core.faults import PapillaTorn
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64, EventChunk

@@ -16,6 +16,7 @@ from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
+from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.settings import AbbSettings
@@ -55,8 +56,11 @@ def arm_on() -> Iterator[MakeArm]:
     """Makes drivers of fakes, which are closed after the test."""
     with ExitStack() as stack:
 
-        def make(robot: FakeUr, connected: bool = True, **settings: Any) -> UrArm:
-            arm = UrArm(ur_settings(robot.host, **settings))
+        def make(
+            robot: FakeUr, connected: bool = True, measures: bool = False, **settings: Any
+        ) -> UrArm:
+            arm = ur.DRIVER.builder(measures)(ur_settings(robot.host, **settings))
+            assert isinstance(arm, UrArm)
             stack.callback(arm.close)
             if connected:
                 arm.connect()
@@ -69,9 +73,9 @@ def arm_on() -> Iterator[MakeArm]:
 def ur_pair(robot_of: MakeRobot, arm_on: MakeArm) -> MakeUr:
     """Makes a UR fake and the driver on it; both are closed after the test."""
 
-    def make(connected: bool = True, **how: Any) -> tuple[UrArm, FakeUr]:
+    def make(connected: bool = True, measures: bool = False, **how: Any) -> tuple[UrArm, FakeUr]:
         robot = robot_of(**how)
-        return arm_on(robot, connected), robot
+        return arm_on(robot, connected, measures), robot
 
     return make
 

@@ -14,8 +14,8 @@ import yaml
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.faults import KINDS, AnyFault
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.fault_kinds import KINDS, AnyFault
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 from tests.protocols.planning import rows

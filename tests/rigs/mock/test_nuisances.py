@@ -10,9 +10,9 @@ import pytest
 
 from sliplab.protocols import InputError, load_plan
 from sliplab.protocols.nuisances import SHIPPED, TrialNuisances
+from sliplab.rigs.core.faults import Knock, Shaking, SkinBrushed
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.fault_book import FaultBook
-from sliplab.rigs.mock.fault_kinds import Knock, Shaking, SkinBrushed
 from sliplab.rigs.mock.nuisances import DAMPING, Shake, brushing, faults_of, swept
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from tests.rigs.mock.driving import SMALL, Trial, same, slide, with_faults

@@ -22,7 +22,6 @@ class FakeExampleFrames(FakeStream):
 
     def __init__(self, scene: SceneFrames, mid_exposure_ns: int) -> None:
         self._scene, self._mid_exposure_ns = scene, mid_exposure_ns
-        scene.on_frames = self._show
         super().__init__("fake frame camera")
 
     def _show(self, frames: FrameChunk) -> None:
@@ -37,7 +36,7 @@ class FakeExampleFrames(FakeStream):
             kind, width, height = REGION.unpack(await reader.readexactly(REGION.size))
             if kind == START:
                 self._write(HEAD.pack(START, 0, 0, 0, 0, 0))
-                self._scene.grab(width, height)
+                self._scene.grab(width, height, self._show)
             else:
                 self._scene.stop_grabbing()
 

@@ -31,7 +31,8 @@ class FakeScene:
         self.stops = 0
         self.last: FrameChunk | None = None
 
-    def grab(self, width_px: int, height_px: int) -> None:
+    def grab(self, width_px: int, height_px: int, on_frames: Callable[[FrameChunk], None]) -> None:
+        self.on_frames = on_frames
         self.grabbed.append((width_px, height_px))
 
     def stop_grabbing(self) -> None:

@@ -34,7 +34,7 @@ def gather(sensor: UrWrench, rows: int) -> WrenchChunk:
 
 
 def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair(connected=False)
+    arm, robot = ur_pair(connected=False, measures=True)
     robot.program.tool_load = lambda t_s: (math.sin(t_s), -2.0, 5.0, 0.1, 0.2, 0.3)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     assert isinstance(sensor, ForceSensor)
@@ -56,7 +56,7 @@ def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
 def test_the_plates_reaction_is_the_force_on_the_plate(ur_pair: MakeUr) -> None:
     frame = PlateFrame.taught([(400, 0, 300), (400, 60, 300), (400, 0, 360)])
     pushed = frame.axes.T @ np.array([0.5, 0.0, 3.0])  # on the plate, in the base
-    arm, robot = ur_pair(connected=False)
+    arm, robot = ur_pair(connected=False, measures=True)
     robot.program.tool_load = lambda t_s: (*(-pushed).tolist(), 0.0, 0.0, 0.0)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     arm.connect()
@@ -66,7 +66,7 @@ def test_the_plates_reaction_is_the_force_on_the_plate(ur_pair: MakeUr) -> None:
 
 
 def test_zero_takes_the_load_away(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair(connected=False)
+    arm, robot = ur_pair(connected=False, measures=True)
     robot.program.tool_load = lambda t_s: (0.0, 0.0, 5.0, 0.0, 0.0, 0.0)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(bias="session"), arm)
     arm.connect()
@@ -77,7 +77,7 @@ def test_zero_takes_the_load_away(ur_pair: MakeUr) -> None:
 
 
 def test_a_lost_link_is_a_fault(ur_pair: MakeUr) -> None:
-    arm, robot = ur_pair(connected=False)
+    arm, robot = ur_pair(connected=False, measures=True)
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     with pytest.raises(RigError, match="the arm that measures it is not connected"):
         sensor.connect()
@@ -104,3 +104,9 @@ def test_an_arm_without_it_is_asked_for_nothing_more(ur_pair: MakeUr) -> None:
 def test_another_arm_has_none() -> None:
     with pytest.raises(RigError, match="needs the arm of driver: ur"):
         WRENCH_DRIVER.build(UrWrenchSettings(), object())  # type: ignore[arg-type]
+
+
+def test_an_arm_that_was_built_without_it_has_none(ur_pair: MakeUr) -> None:
+    arm, _ = ur_pair(connected=False)
+    with pytest.raises(RigError, match="was built without its wrench"):
+        WRENCH_DRIVER.build(UrWrenchSettings(), arm)

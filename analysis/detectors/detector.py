@@ -1,8 +1,9 @@
-"""Interface of a detector in the bench: events in, evidence out.
+"""Interface of a detector: events in, evidence out.
 
-A detector is given a scene's events in the order of time, some at once, with the moment up to which
-they are complete. It answers with its evidence for slip and when that was known. The bench sets the
-level above which the evidence is an alarm, so a detector has no threshold.
+A detector is given a sensor's events in the order of time, some at once, with the moment up to
+which they are complete. It answers with its evidence for slip and when that was known. Who uses it
+sets the level above which the evidence is an alarm, so a detector has no threshold. A scene of the
+bench, a stored trial and a rig's running stream (`StreamDetector`) are pushed to the same object.
 """
 
 from __future__ import annotations
@@ -14,10 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.storage.streams import EventChunk
 
 NO_LABEL = -1
 """Label of a decision without a class."""
+
+
+NOTHING_US = -(1 << 62)
+"""Time before all events."""
+
+
+class DetectorError(ValueError):
+    """A detector broke the rules of its interface, or failed."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +70,26 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class JudgedWindow:
+    """What one answer rests on. Time in microseconds since the detector began.
+
+    Attributes:
+        number: from 0; a network's windows leave out those in a gap.
+        events: of the window, all over the sensor and of both polarities.
+        last_event_us: the latest of them; None in a window without events.
+        counts: a network's output spikes in the order of `analysis.metrics.classification.CLASSES`.
+        smoothed: their trailing means; both are None for a detector without a network.
+    """
+
+    number: int
+    start_us: int
+    events: int
+    last_event_us: int | None
+    counts: tuple[int, int, int] | None = None
+    smoothed: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Answers of a detector, in the order of time.
 
@@ -67,11 +97,13 @@ class Evidence:
         t_us: int64 (n,), when each was known: the end of the events that it rests on.
         value: float64 (n,), evidence for slip, finite or -inf; larger is more.
         label: int8 (n,), 0 no slip, 1 incipient, 2 gross slip; `NO_LABEL` without classes.
+        windows: n of them from a `StreamDetector`; others may leave them out.
     """
 
     t_us: npt.NDArray[np.int64]
     value: npt.NDArray[np.float64]
     label: npt.NDArray[np.int8]
+    windows: tuple[JudgedWindow, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -141,3 +173,59 @@ class Detector(ABC):
 
     def close(self) -> None:  # noqa: B027
         """Release what it holds, such as a process. By default nothing."""
+
+
+class StreamDetector(Detector):
+    """A detector on a running stream, whose labels are its decisions.
+
+    Events may come out of order. Those of a call are sorted; they may be older than the last
+    call's, and as young as `until_us`.
+    """
+
+    span_us: int = 0
+    """Span of the events that a decision rests on; 0 where it is not known."""
+
+    @property
+    @abstractmethod
+    def settled_us(self) -> int:
+        """Time before which events no longer count; `NOTHING_US` before anything is settled."""
+
+    @abstractmethod
+    def resume(self, at_us: int) -> None:
+        """Begin again at a time, before which the stream was interrupted."""
+
+
+def checked(found: object, before_us: int, until_us: int) -> Evidence:
+    """Return evidence that keeps the rules.
+
+    Args:
+        before_us, until_us: the moments up to which events were complete before, and now.
+
+    Raises:
+        DetectorError: it is none, is not of that time, or is not a number.
+    """
+    if not isinstance(found, Evidence):
+        raise DetectorError(f"push returned {type(found).__name__}; must be Evidence")
+    n = len(found.t_us)
+    if found.value.shape != (n,) or found.label.shape != (n,):
+        raise DetectorError(
+            f"evidence has {n} times, {found.value.shape} values and {found.label.shape} labels; "
+            "must be as many"
+        )
+    if not n:
+        return found
+    if (np.diff(found.t_us) <= 0).any():
+        raise DetectorError("times of evidence must increase")
+    first, last = int(found.t_us[0]), int(found.t_us[-1])
+    if first <= before_us or last > until_us:
+        wrong = first if first <= before_us else last
+        raise DetectorError(
+            f"evidence at {wrong} us; must be after {before_us} us and not after {until_us} us, "
+            "up to which it was given events"
+        )
+    if np.isnan(found.value).any() or (found.value == np.inf).any():
+        raise DetectorError("a value of evidence is nan or inf; must be finite or -inf")
+    if found.label.min() < NO_LABEL or found.label.max() >= len(CLASSES):
+        wrong = int(found.label.min() if found.label.min() < NO_LABEL else found.label.max())
+        raise DetectorError(f"label = {wrong}: must be -1 (none), 0, 1 or 2")
+    return found

@@ -1,11 +1,11 @@
-"""Detectors by name: those that ship, those of other packages, and those of files and commands.
+"""Detectors by name: those of plug-ins and other packages, and those of files and commands.
 
 A detector is named by
 
-- a name of `SHIPPED`, of a plug-in, or of the entry point group `sliplab.detectors`;
+- a name that a plug-in declares, or one of the entry point group `sliplab.detectors`;
 - ``module:attribute``, a class or function that takes no argument and returns a `Detector`;
-- the path of an ONNX file (`entries.onnx_model`);
-- ``run:COMMAND``, a program that reads standard input and answers on output (`entries.program`).
+- the path of an ONNX file, or ``run:COMMAND``, a program that reads standard input and answers on
+  output; the plug-in `bench` runs both.
 """
 
 from __future__ import annotations
@@ -19,31 +19,13 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from sliplab.plugins.bench.interface import Detector
+from sliplab.analysis.detectors.detector import Detector
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, foreign_code
 from sliplab.protocols.shown import did_you_mean
 
 GROUP = "sliplab.detectors"
-_ENTRIES = "sliplab.plugins.bench.entries"
-SHIPPED = {
-    "paper": f"{_ENTRIES}.network:PaperEntry",
-    "ours": f"{_ENTRIES}.network:Ours",
-    "paper_physical": f"{_ENTRIES}.network:PaperByPhysicalOnset",
-    "ours_2px": f"{_ENTRIES}.network:OursByPaperOnset",
-    "cnn": f"{_ENTRIES}.nets:Cnn",
-    "cnn_2px": f"{_ENTRIES}.nets:CnnByPaperOnset",
-    "gru": f"{_ENTRIES}.nets:Gru",
-    "boosting": f"{_ENTRIES}.boosting:Boosting",
-    "hyperdimensional": f"{_ENTRIES}.hyperdimensional:Hyperdimensional",
-    "rate": f"{_ENTRIES}.thresholds:EventRate",
-    "flow": f"{_ENTRIES}.thresholds:Flow",
-    "always": f"{_ENTRIES}.trivial:Always",
-    "never": f"{_ENTRIES}.trivial:Never",
-    "random": f"{_ENTRIES}.trivial:Random",
-    "clock": f"{_ENTRIES}.trivial:ByTheClock",
-}
 PROGRAM, ONNX = "run:", ".onnx"
 _KEY = "DETECTOR"
 
@@ -51,7 +33,12 @@ _KEY = "DETECTOR"
 def known() -> dict[str, str]:
     """Return ``module:attribute`` by name; another package cannot replace a shipped detector."""
     pointed = {point.name: point.value for point in entry_points(group=GROUP)}
-    return pointed | plugins().declared("detectors") | SHIPPED
+    return pointed | plugins().declared("detectors")
+
+
+def is_known(name: str) -> bool:
+    """Return whether a name has the form of a detector's, or is one."""
+    return ":" in name or name.endswith(ONNX) or name in known()
 
 
 def contents(name: str) -> list[str]:
@@ -73,14 +60,9 @@ def make_detector(name: str) -> Detector:
     Raises:
         InputError: it does not exist, or cannot be created.
     """
-    if name.startswith(PROGRAM):
-        from sliplab.plugins.bench.entries.program import ExternalProcess
-
-        return ExternalProcess(name.removeprefix(PROGRAM))
-    if name.endswith(ONNX):
-        from sliplab.plugins.bench.entries.onnx_model import OnnxModel
-
-        return OnnxModel(name)
+    if name.startswith(PROGRAM) or name.endswith(ONNX):
+        made: Detector = plugins().hook("foreign_detector")(name)
+        return made
     names = known()
     if name not in names and ":" not in name:
         hint = did_you_mean(name, names)
@@ -104,12 +86,12 @@ def _imported(name: str, place: str) -> Detector:
         with foreign_code():
             made = getattr(import_module(module), attribute)()
     except ModuleNotFoundError as error:
-        if place == SHIPPED.get(name) or error.name != module:
+        if place.startswith("sliplab.") or error.name != module:
             raise  # the extra that is missing is named where the command ends
         raise InputError(_KEY, "", name, f"no module {module} to import") from None
     except PluginError as error:
         raise InputError(_KEY, "", name, f"cannot be made: {error}") from None
     if not isinstance(made, Detector):
-        text = f"{place}() is a {type(made).__name__}, not a sliplab.plugins.bench Detector"
+        text = f"{place}() is a {type(made).__name__}, not a sliplab.analysis.detectors Detector"
         raise InputError(_KEY, "", name, text)
     return made

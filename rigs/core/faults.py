@@ -1,12 +1,15 @@
-"""Settings of simulated faults, as in rig files and tests: `mock: faults: [...]`.
+"""The table of faults: of simulated devices, and of the fakes that real drivers speak to.
 
-Each kind of fault has its own model with only the parameters that apply to it; docs/faults.md lists
-them for users. Cheap to import, as all settings are.
+Each kind of fault is a model: its name, its meaning, its parameters and the devices that have it.
+Simulated devices have those of `AnyFault` at times that a rig file names (`mock: faults: [...]`);
+docs/faults.md lists them for users. Fakes have those `on_wire`, which tests inject at once.
+Cheap to import, as all settings are.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from collections.abc import Callable, Mapping
+from typing import Annotated, ClassVar, Literal, TypeVar, get_args
 
 from pydantic import Field
 
@@ -24,9 +27,16 @@ RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 
+INJECT = "inject"
+"""Method of a fake that is told the kind."""
+
+
 class BaseFault(StrictModel):
     """What every fault has."""
 
+    wired: ClassVar[Mapping[str, str]] = {}
+    """Devices whose fakes have it, each with the method of the fake that causes it
+    (`rigs.core.driver`). A driver's name stands for the fake of that driver alone."""
     trial: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Number of the trial on this rig, from 1; every trial if left out."""
 
@@ -37,6 +47,19 @@ class BaseFault(StrictModel):
         return target
 
 
+F = TypeVar("F", bound=BaseFault)
+
+
+def on_wire(**methods: str) -> Callable[[type[F]], type[F]]:
+    """Return a decorator that says which fakes have a fault; see `BaseFault.wired`."""
+
+    def mark(model: type[F]) -> type[F]:
+        model.wired = methods
+        return model
+
+    return mark
+
+
 class _TimedFault(BaseFault):
     at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.5
     """Time of the fault after the moment that `since` names."""
@@ -44,6 +67,7 @@ class _TimedFault(BaseFault):
     """`trial`: the trial's start; `recording`: the start of the sync box."""
 
 
+@on_wire(arm=INJECT)
 class ArmProtectiveStop(_TimedFault):
     """The arm makes a protective stop, and does not move until the operator clears it."""
 
@@ -93,6 +117,7 @@ class EventGap(_TimedFault):
     seconds: Seconds = 0.1
 
 
+@on_wire(event_camera="stall")
 class EventStall(_TimedFault):
     """The event camera sends nothing for some time, and then everything."""
 
@@ -118,6 +143,7 @@ class ClockDrift(_TimedFault):
     """Change of the clock's drift; negative if it loses time."""
 
 
+@on_wire(arm=INJECT)
 class ClockJump(_TimedFault):
     """A device's clock jumps."""
 
@@ -127,6 +153,7 @@ class ClockJump(_TimedFault):
     """Size of the jump, backwards if negative."""
 
 
+@on_wire(sync_box="reset", ati_net_ft=INJECT)
 class ClockRestart(_TimedFault):
     """A device's clock restarts at 0, as after a power loss."""
 
@@ -319,6 +346,7 @@ class DiskFull(_TimedFault):
     kind: Literal["disk_full"]
 
 
+@on_wire(arm=INJECT, event_camera="close", sync_box="close", force_sensor="close", gripper="close")
 class DeviceGone(_TimedFault):
     """A device loses its power or its cable; every call fails."""
 
@@ -336,6 +364,113 @@ class StreamGone(_TimedFault):
     """Name of its stream."""
     seconds: Seconds | None = None
     """If left out, the device is gone for good."""
+
+
+@on_wire(
+    arm=INJECT, sync_box="silence", force_sensor="silence", gripper="silence", ati_net_ft=INJECT
+)
+class DeviceSilent(BaseFault):
+    """A device answers and sends nothing more; its connections stay open, new ones are accepted."""
+
+    kind: Literal["device_silent"]
+
+
+@on_wire(arm=INJECT, sync_box="answer_late")
+class AnswerLate(BaseFault):
+    """The answer to the next request comes only with the answer to the one after it."""
+
+    kind: Literal["answer_late"]
+
+
+@on_wire(arm=INJECT)
+class PosesLost(BaseFault):
+    """The next `rigs.core.fakes.PACKETS_LOST` packets of poses are not sent."""
+
+    kind: Literal["poses_lost"]
+
+
+@on_wire(arm=INJECT)
+class ArmEmergencyStop(BaseFault):
+    """Somebody presses the emergency stop."""
+
+    kind: Literal["arm_emergency_stop"]
+
+
+@on_wire(arm=INJECT)
+class ArmSafeguardStop(BaseFault):
+    """A light curtain or a door stops the arm; a running program is paused."""
+
+    kind: Literal["arm_safeguard_stop"]
+
+
+@on_wire(arm=INJECT)
+class ArmPowerOff(BaseFault):
+    """The operator switches the arm off, but not its controller."""
+
+    kind: Literal["arm_power_off"]
+
+
+@on_wire(arm=INJECT)
+class ArmRemoteOff(BaseFault):
+    """The operator takes remote control away."""
+
+    kind: Literal["arm_remote_off"]
+
+
+@on_wire(arm=INJECT)
+class ArmProgramEnd(BaseFault):
+    """The operator presses stop at the pendant."""
+
+    kind: Literal["arm_program_end"]
+
+
+@on_wire(arm=INJECT)
+class ArmProgramPaused(BaseFault):
+    """The operator presses pause at the pendant."""
+
+    kind: Literal["arm_program_paused"]
+
+
+@on_wire(force_sensor="overload", ati_net_ft=INJECT)
+class ForceOverload(BaseFault):
+    """The load is out of a force sensor's range; of some records where they are counted."""
+
+    kind: Literal["force_overload"]
+
+
+@on_wire(ati_net_ft=INJECT)
+class RecordsLost(BaseFault):
+    """Records of a force sensor do not arrive."""
+
+    kind: Literal["records_lost"]
+
+
+@on_wire(ati_net_ft=INJECT)
+class RecordsReordered(BaseFault):
+    """A record of a force sensor comes after the one that follows it."""
+
+    kind: Literal["records_reordered"]
+
+
+@on_wire(ati_net_ft=INJECT)
+class RecordsDuplicated(BaseFault):
+    """Records of a force sensor come twice."""
+
+    kind: Literal["records_duplicated"]
+
+
+@on_wire(ati_net_ft=INJECT)
+class RecordsMalformed(BaseFault):
+    """Datagrams of a force sensor are cut short."""
+
+    kind: Literal["records_malformed"]
+
+
+@on_wire(gripper="fail")
+class GripperFault(BaseFault):
+    """A gripper reports a fault."""
+
+    kind: Literal["gripper_fault"]
 
 
 AnyFault = (
@@ -370,10 +505,23 @@ AnyFault = (
 )
 Fault = Annotated[AnyFault, Field(discriminator="kind")]
 """One fault, discriminated by its `kind`."""
-KINDS: tuple[str, ...] = tuple(
-    get_args(model.model_fields["kind"].annotation)[0] for model in get_args(AnyFault)
-)
+
+
+def kind_of(model: type[BaseFault]) -> str:
+    """Return the name of a kind of fault."""
+    name: str = get_args(model.model_fields["kind"].annotation)[0]
+    return name
+
+
+KINDS: tuple[str, ...] = tuple(kind_of(model) for model in get_args(AnyFault))
+"""Kinds that a rig file may name."""
 register_tags(*KINDS)
+
+
+def wired(device: str) -> dict[str, str]:
+    """Return the faults of a device's fakes: by kind, the method of the fake that causes it."""
+    models = [*get_args(AnyFault), *BaseFault.__subclasses__()]
+    return {kind_of(it): it.wired[device] for it in models if device in it.wired}
 
 
 def check_papillae(faults: tuple[AnyFault, ...], count: int) -> None:

@@ -1,0 +1,103 @@
+"""Any detector on a running stream: its evidence above a level is slip."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sliplab.analysis.detectors.detector import (
+    NOTHING_US,
+    Detector,
+    DetectorError,
+    Evidence,
+    JudgedWindow,
+    StreamDetector,
+    checked,
+)
+from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
+from sliplab.storage.streams import EventChunk
+
+
+class AtLevel(StreamDetector):
+    """A detector with its level. Evidence above it is gross slip by the detector's own class alone.
+
+    The detector is given events in order: those that are older than what it has been given are left
+    out, and those at the newest moment wait, as others of that moment may follow.
+
+    Args:
+        level: that the evidence must exceed.
+    """
+
+    def __init__(self, detector: Detector, level: float) -> None:
+        self.detector, self.level = detector, level
+
+    def begin(self, width: int, height: int) -> None:
+        """See `Detector`. Raises DetectorError."""
+        self._size, self._number = (width, height), 0
+        self.resume(0)
+
+    def resume(self, at_us: int) -> None:
+        """Begin a new scene. Raises DetectorError."""
+        self._from_us = self._settled_us = self._window_us = at_us
+        self._held = EventChunk.empty()
+        self._events = 0
+        self._last_us: int | None = None
+        try:
+            self.detector.begin(*self._size)
+        except Exception as error:  # another package's code: whatever it raises
+            raise _failure(error) from error
+
+    @property
+    def settled_us(self) -> int:
+        """The moment up to which the detector has been given everything."""
+        return self._settled_us if self._settled_us > self._from_us else NOTHING_US
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        """See `StreamDetector`. Raises DetectorError."""
+        before_us = self._settled_us
+        held = EventChunk.concatenate([self._held, events[events.t_us >= before_us]])
+        if (np.diff(held.t_us) < 0).any():
+            held = held[np.argsort(held.t_us, kind="stable")]
+        cut = int(np.searchsorted(held.t_us, until_us))
+        given, self._held = held[:cut], held[cut:]
+        if until_us <= before_us:
+            return Evidence.of([], [])
+        self._settled_us = until_us
+        start_us = self._from_us
+        moved = replace(given, t_us=given.t_us - start_us)
+        try:
+            found = self.detector.push(moved, until_us - start_us)
+        except Exception as error:  # another package's code: whatever it raises
+            raise _failure(error) from error
+        found = checked(found, before_us - start_us, until_us - start_us)
+        slip = np.where(found.label == GROSS, GROSS, INCIPIENT)
+        label = np.where(found.value > self.level, slip, NO_SLIP).astype(np.int8)
+        t_us = found.t_us + start_us
+        return Evidence(t_us, found.value, label, self._windows(given, t_us.tolist()))
+
+    def close(self) -> None:
+        """See `Detector`."""
+        self.detector.close()
+
+    def _windows(self, given: EventChunk, ends_us: list[int]) -> tuple[JudgedWindow, ...]:
+        """Return the spans between answers, and count the events of the one that is open."""
+        made, begin = [], 0
+        for end_us in ends_us:
+            self._count(given, begin, end := int(np.searchsorted(given.t_us, end_us)))
+            made.append(JudgedWindow(self._number, self._window_us, self._events, self._last_us))
+            begin, self._window_us, self._number = end, end_us, self._number + 1
+            self._events, self._last_us = 0, None
+        self._count(given, begin, len(given))
+        return tuple(made)
+
+    def _count(self, given: EventChunk, begin: int, end: int) -> None:
+        self._events += end - begin
+        if end > begin:
+            self._last_us = int(given.t_us[end - 1])
+
+
+def _failure(error: Exception) -> DetectorError:
+    if isinstance(error, DetectorError):
+        return error
+    return DetectorError(f"{type(error).__name__}: {error}")

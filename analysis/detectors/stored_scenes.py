@@ -1,0 +1,99 @@
+"""Labelled trials of a store as scenes, which train a detector and set its level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
+from sliplab.analysis.detectors.detector_comparison import TrialEvidence, allowed_early, set_levels
+from sliplab.analysis.detectors.detectors import WindowEvidence
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.latency import TrueSlip, true_slip
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.protocols.detection import ComparisonSettings
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
+
+
+def fitted_to(store: Store, detector: Detector) -> AtLevel:
+    """Return a detector that the store's training trials trained, at the level of its validation.
+
+    The level is that of the detector comparison: the lowest at which at most the middle one of
+    `compare.rates` of the validation trials are false early.
+
+    Raises:
+        StoreError: no training or validation trial has both onsets, or one has no events.
+        DetectorError: the evidence is invalid.
+    """
+    campaigns, labels = training_campaigns(collected(store, None)), StoreLabels(store)
+    rule = campaigns[0].settings.detection
+    asked = rule.compare or ComparisonSettings()
+    train = scenes(labels, campaigns, "train", asked.train_trials)
+    validation = scenes(labels, campaigns, "validation")
+    detector.train(train, validation)
+    judged = [TrialEvidence(_windows(feed(detector, it)), _slip(it)) for it in validation]
+    rate = asked.rates[len(asked.rates) // 2]
+    levels = set_levels(judged, allowed_early(rate, len(judged)), round(rule.false_early_ms * 1e6))
+    return AtLevel(detector, levels.incipient)
+
+
+def scenes(
+    labels: StoreLabels, campaigns: Sequence[Collected], split: str, most: int | None = None
+) -> list[Scene]:
+    """Return the trials of a part of the split that have both onsets; at most so many.
+
+    Raises:
+        StoreError: there is none, or one has no events.
+    """
+    found: list[Scene] = []
+    for item in campaigns:
+        for _, recording in item.of_split(split):
+            slip = true_slip(labels.read(item, recording))
+            if slip is not None and (most is None or len(found) < most):
+                found.append(scene(recording, f"{item.name}/{recording.folder.name}", slip))
+    if not found:
+        raise StoreError(f"{labels.store.folder}: no {split} trial has both onsets")
+    return found
+
+
+def scene(recording: Recording, name: str, slip: TrueSlip) -> Scene:
+    """Return a trial's events from the start of its recording, with the slip that its label gives.
+
+    Raises:
+        StoreError: it has no events.
+    """
+    clock = recording.clock("events")
+    span_ns = recorded_span(recording)
+
+    def us(time_ns: int) -> int:
+        return int(clock.to_device(time_ns)) // 1000
+
+    begin_us = us(span_ns[0])
+    events = recording.events()
+    first, last = np.searchsorted(events.t_us, [begin_us, us(span_ns[1])]).tolist()
+    part = events[first:last]
+    incipient_us = us(slip.incipient_ns) - begin_us
+    return Scene(
+        name,
+        replace(part, t_us=part.t_us - begin_us),
+        *recording.event_px,
+        us(span_ns[1]) - begin_us,
+        Slip(incipient_us, incipient_us, us(slip.gross_ns) - begin_us),
+    )
+
+
+def _windows(found: Evidence) -> WindowEvidence:
+    none: npt.NDArray[np.float64] = np.full(len(found), -np.inf)
+    return WindowEvidence(found.t_us * 1000, found.value, lambda first: none)
+
+
+def _slip(given: Scene) -> TrueSlip:
+    gross_us = given.slip.gross_us
+    return TrueSlip(given.slip.paper_us * 1000, gross_us * 1000, max(given.end_us, gross_us) * 1000)

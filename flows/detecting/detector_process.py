@@ -1,0 +1,165 @@
+"""A network or a detector in a separate process, so that the arm stops if it hangs or crashes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence
+from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+from sliplab.storage.streams import EventChunk
+
+START_S = 180.0
+"""Timeout for the process to start: kernels may have to be compiled, s."""
+TRAIN_S = 3600.0
+"""The same where it trains a detector first, s."""
+PATIENT_S = 30.0
+"""Timeout of an answer in virtual time, where none is late, s."""
+
+
+class NetworkLost(LibraryError):
+    """The network's process died, or did not answer in time."""
+
+
+class NetworkProcess:
+    """A network in a separate process: a `Counting` of `analysis.detectors.network_detector`.
+
+    Args:
+        model: its file.
+        answer_s: timeout of an answer.
+
+    Raises:
+        NetworkLost: it does not start.
+    """
+
+    def __init__(self, model: Path, answer_s: float) -> None:
+        self._answer_s = answer_s
+        self._process = LibraryProcess(
+            "network's process", f"{__name__}:serve", (str(model),), START_S, NetworkLost
+        )
+
+    def __call__(self, x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+        """Return the output spikes of one window. Raises NetworkLost."""
+        counts: npt.NDArray[np.int64] = self._process.call("counts", x, within_s=self._answer_s)
+        return counts
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def kill(self) -> None:
+        """End the process at once, for tests; every later call fails."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.end()
+
+
+class DetectorProcess(Detector):
+    """A detector by its name in a separate process, which trains it.
+
+    Args:
+        name, level, store: as `flows.detecting.sources.NamedSource`.
+        answer_s: timeout of an answer.
+
+    Raises:
+        DetectorError: it does not start.
+    """
+
+    def __init__(self, name: str, level: float | None, store: Path | None, answer_s: float) -> None:
+        self._answer_s = answer_s
+        arguments = name, level, None if store is None else str(store)
+        with _as_detector_error():
+            self._process = LibraryProcess(
+                "detector's process", f"{__name__}:serve_detector", arguments, TRAIN_S
+            )
+            self.level: float = self._process.call("level", within_s=PATIENT_S)
+
+    def begin(self, width: int, height: int) -> None:
+        """See `Detector`. Raises DetectorError."""
+        with _as_detector_error():
+            self._process.call("begin", width, height, within_s=PATIENT_S)
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        """See `Detector`. Raises DetectorError."""
+        with _as_detector_error():
+            found: Evidence = self._process.call("push", events, until_us, within_s=self._answer_s)
+            return found
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.end()
+
+
+@contextmanager
+def _as_detector_error() -> Iterator[None]:
+    try:
+        yield
+    except LibraryError as error:
+        raise DetectorError(str(error)) from error
+
+
+def serve_detector(fd: int, name: str, level: float | None, store: str | None) -> None:
+    """Run the process: train the detector, then answer calls from the pipe on `fd`."""
+    pipe = Connection(fd)
+    with suppress(EOFError, OSError):
+        try:
+            # only here, because the parent needs no second copy
+            from sliplab.analysis.networks import training
+            from sliplab.flows.detecting.sources import NamedSource
+
+            training.limit_threads(1)
+            made = NamedSource(name, level, None if store is None else Path(store)).detector()
+        except Exception as error:
+            pipe.send((False, str(error)))
+            os._exit(1)
+        pipe.send((True, None))
+        detector = made.detector
+        calls = {"level": lambda: made.level, "begin": detector.begin, "push": detector.push}
+        _answer(pipe, lambda what, arguments: calls[what](*arguments))
+        made.close()
+    os._exit(0)
+
+
+def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any]) -> None:
+    """Answer calls until the pipe closes."""
+    with suppress(EOFError, OSError):
+        while True:
+            what, arguments, _ = pipe.recv()
+            answer: tuple[bool, Any]
+            try:
+                answer = True, work(what, arguments)
+            except Exception as error:
+                answer = False, repr(error)
+            pipe.send(answer)
+
+
+def serve(fd: int, model: str) -> None:
+    """Run the process: answer windows from the pipe on `fd` until it closes."""
+    pipe = Connection(fd)
+    with suppress(EOFError, OSError):
+        try:
+            # only here, because the parent needs no second copy
+            from sliplab.analysis.detectors.network_detector import counting_of
+            from sliplab.analysis.networks import model_file, training
+
+            training.limit_threads(1)
+            fitted = model_file.load(Path(model))
+            counting, w = counting_of(fitted), fitted.windows
+            # the first window must not wait for what is loaded and compiled
+            counting(np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8))
+        except Exception as error:
+            pipe.send((False, str(error)))
+            os._exit(1)
+        pipe.send((True, None))
+        _answer(pipe, lambda what, arguments: counting(*arguments))
+    os._exit(0)

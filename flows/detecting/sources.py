@@ -1,0 +1,171 @@
+"""What detects on a rig: a network with its rule, or a detector by its name.
+
+Where a safe state depends on it, what may hang or crash runs in a separate process, so that the arm
+stops all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.detector import Detector, StreamDetector
+from sliplab.analysis.detectors.detectors import Tuned
+from sliplab.analysis.detectors.network_detector import Counting, NetworkDetector, counting_of
+from sliplab.analysis.detectors.registry import make_detector
+from sliplab.analysis.detectors.stored_scenes import fitted_to
+from sliplab.analysis.networks.training import Fitted
+from sliplab.flows.detecting.detector_process import DetectorProcess, NetworkProcess
+from sliplab.protocols.detection import Detection
+from sliplab.protocols.errors import InputError
+from sliplab.storage.trials.store import Store
+
+
+@dataclass(frozen=True)
+class NetworkSource:
+    """A trained network, with what reads its spikes.
+
+    Attributes:
+        detection: the paper's rule by its settings, or another rule with its levels.
+        stride_ms: from one window's start to the next one's; None for the window's length.
+    """
+
+    model: Path
+    sha256: str
+    fitted: Fitted
+    detection: Detection | Tuned
+    stride_ms: float | None = None
+
+    @property
+    def title(self) -> str:
+        """What is shown of it."""
+        return f"model {self.model.name}"
+
+    @property
+    def most(self) -> int:
+        """Spikes that a class can give in a window."""
+        return self.fitted.windows.steps * self.fitted.network.outputs_per_class
+
+    def detector(
+        self, counting: Counting | None = None, centre_px: tuple[float, float] | None = None
+    ) -> NetworkDetector:
+        """Return the detector in this process.
+
+        Args:
+            counting: the network; by default the event-driven kernels in one thread.
+        """
+        stride_us = None if self.stride_ms is None else round(self.stride_ms * 1000)
+        return NetworkDetector(
+            counting or counting_of(self.fitted),
+            self.fitted.windows,
+            self.detection,
+            centre_px=centre_px,
+            stride_us=stride_us,
+        )
+
+    @contextmanager
+    def running(
+        self, answer_s: float | None, centre_px: tuple[float, float] | None
+    ) -> Iterator[StreamDetector]:
+        """Yield the detector.
+
+        Args:
+            answer_s: timeout of an answer of the network's own process; None: in this one.
+
+        Raises:
+            NetworkLost: the process does not start.
+        """
+        if answer_s is None:
+            yield self.detector(None, centre_px)
+            return
+        with closing(NetworkProcess(self.model, answer_s)) as network:
+            yield self.detector(network, centre_px)
+
+
+@dataclass(frozen=True)
+class NamedSource:
+    """A detector by its name (`analysis.detectors.registry`).
+
+    Attributes:
+        level: that its evidence must exceed; None: validation trials of `store` set it.
+        store: whose trials train it; None where it needs no training.
+    """
+
+    name: str
+    level: float | None
+    store: Path | None
+
+    @property
+    def title(self) -> str:
+        """What is shown of it."""
+        return f"detector {self.name}"
+
+    @property
+    def most(self) -> None:
+        """No spikes are shown."""
+        return
+
+    def detector(self) -> AtLevel:
+        """Return the detector in this process, trained and at its level.
+
+        Raises:
+            InputError: there is none of the name.
+            StoreError: see `fitted_to`.
+            DetectorError: it cannot be trained.
+        """
+        made = make_detector(self.name)
+        try:
+            if self.level is not None and not needs_training(made):
+                return AtLevel(made, self.level)
+            assert self.store is not None, "the request was checked"
+            fitted = fitted_to(Store(self.store), made)
+            return fitted if self.level is None else AtLevel(made, self.level)
+        except BaseException:
+            made.close()
+            raise
+
+    @contextmanager
+    def running(
+        self, answer_s: float | None, centre_px: tuple[float, float] | None
+    ) -> Iterator[StreamDetector]:
+        """Yield the detector; see `NetworkSource.running`. It takes no centre of a crop.
+
+        Raises:
+            DetectorError: it cannot be trained, or its process does not start.
+        """
+        if answer_s is None:
+            with closing(self.detector()) as made:
+                yield made
+            return
+        with closing(DetectorProcess(self.name, self.level, self.store, answer_s)) as process:
+            yield AtLevel(process, process.level)
+
+
+Source: TypeAlias = NetworkSource | NamedSource
+
+
+def needs_training(detector: Detector) -> bool:
+    """Return whether a detector's class trains it."""
+    return type(detector).train is not Detector.train
+
+
+def named_source(name: str, level: float | None, store: Path | None) -> NamedSource:
+    """Check that a detector can be had.
+
+    Raises:
+        InputError: there is none of the name, or it needs a store.
+    """
+    made = make_detector(name)
+    trained = needs_training(made)
+    made.close()
+    if store is None and trained:
+        right = f"is needed: '{name}' is trained on the trials of a store"
+        raise InputError("--model", "", None, right)
+    if store is None and level is None:
+        right = f"is needed, or a store as --model, whose validation trials set it for '{name}'"
+        raise InputError("--level", "", None, right)
+    return NamedSource(name, level, store)

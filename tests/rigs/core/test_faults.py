@@ -1,0 +1,43 @@
+"""The table of faults, against the devices and the fakes that have them."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from sliplab.rigs.core import driver, faults
+from sliplab.rigs.core.fakes import FakeController, Kind
+from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt, SensorFaultKind
+
+FAKES = {
+    "arm": FakeController,
+    "event_camera": driver.FakeEventCamera,
+    "sync_box": driver.FakeBox,
+    "force_sensor": driver.FakeForceSensor,
+    "gripper": driver.FakeGripper,
+    "ati_net_ft": FakeNetFt,
+}
+
+
+@pytest.mark.parametrize("device", FAKES)
+def test_a_fake_has_the_methods_of_its_faults(device: str) -> None:
+    found = faults.wired(device)
+    assert found
+    for method in found.values():
+        assert callable(getattr(FAKES[device], method))
+
+
+def test_a_fake_that_is_told_the_kind_knows_those_of_the_table() -> None:
+    for device, kinds in (("arm", Kind), ("ati_net_ft", SensorFaultKind)):
+        assert {kind.value for kind in kinds} == set(faults.wired(device))
+
+
+def test_every_kind_has_one_name_and_a_meaning() -> None:
+    models = [*get_args(faults.AnyFault), *faults.BaseFault.__subclasses__()]
+    kinds = [faults.kind_of(it) for it in models if "kind" in it.model_fields]
+    named = dict(zip(kinds, models, strict=False))
+    assert all(it.__doc__ for it in named.values())
+    devices = {device for it in named.values() for device in it.wired}
+    assert devices == set(FAKES)
+    assert {"device_gone", "clock_jump", "arm_protective_stop", "event_stall"} <= set(faults.KINDS)
