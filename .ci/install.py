@@ -22,7 +22,8 @@ def main(extras: str) -> int:
     own = [*PIP, *QUIET, "--disable-pip-version-check", "--no-compile"]  # Python compiles at import
     if subprocess.run([*own, "uv"]).returncode == 0:
         settings = pip_settings()
-        options = [f"--{name}={each}" for name in PASSED_ON for each in settings.get(name, "").split()]
+        places = [(name, place) for name in PASSED_ON for place in settings.get(name, "").split()]
+        options = [f"--{name}={place}" for name, place in places]
         uv = [sys.executable, "-m", "uv", "pip", *QUIET, f"--python={sys.executable}"]
         uv += ["--index-strategy=unsafe-best-match", *options]  # pip's: the best of all indexes
         certificates = {"SSL_CERT_FILE": settings["cert"]} if "cert" in settings else {}
