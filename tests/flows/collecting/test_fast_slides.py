@@ -13,10 +13,8 @@ from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import tiny
 
 FRAME_MS = 10.0
-SLIDES = [
-    (2.4, 20.0),
-    *(pytest.param(*it, marks=pytest.mark.long) for it in ((2.4, 6), (1.8, 1.6))),
-]
+LONG = ((2.4, 6.0), (1.8, 1.6))
+SLIDES = [(2.4, 20.0), *(pytest.param(*each, marks=pytest.mark.long) for each in LONG)]
 
 
 @pytest.mark.parametrize(("depth_mm", "speed_mm_s"), SLIDES, ids=str)
