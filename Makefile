@@ -5,12 +5,12 @@ BIN := .venv/bin
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 DONE := .venv/.installed
 DEMO := .venv/.demo
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
+INSTALL := $(BIN)/python .ci/install.py
 
 # what one worker or program has compiled, the others need not
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-core test-programs test-realtime test-long lint types imports docs bench clean
+.PHONY: setup demo test test-core test-programs test-virtual test-realtime test-long lint types imports docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -18,12 +18,12 @@ setup: $(DONE)
 # what simulates first: while one processor installs the rest, the other compiles kernels
 define install
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) '.[video]'
+	$(INSTALL) video
 	$(BIN)/python .ci/kernels.py $(2) & kernels=$$!; \
-	$(PIP) '.[$(1)]'; installed=$$?; wait $$kernels; exit $$installed
+	$(INSTALL) $(1); installed=$$?; wait $$kernels; exit $$installed
 endef
 
-NEEDS := pyproject.toml setup.py constraints.txt
+NEEDS := pyproject.toml setup.py constraints.txt .ci/install.py
 $(DONE): $(NEEDS)
 	$(call install,dev,rehearsal mock)
 	touch $(DEMO) $(DONE)
@@ -47,6 +47,10 @@ test-core: $(DONE)
 # whole programs, servers and clusters; they wait more than they compute
 test-programs: $(DONE)
 	$(PYTEST) -n 3 --dist loadgroup --no-loadscope-reorder -m 'programs and not realtime and not long'
+
+# both, where what waits is beside what computes, and everything is loaded once
+test-virtual: $(DONE)
+	$(PYTEST) -n 3 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not long'
 
 # fakes in real time: whole scenes, which compute, one after another; beside them the rest. A shared
 # machine may stop a process for longer than a device's silence: what failed must pass alone.

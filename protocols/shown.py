@@ -13,6 +13,7 @@ import unicodedata
 from collections.abc import Iterable
 from datetime import date
 from decimal import Decimal
+from functools import lru_cache
 
 MASK = "****"
 
@@ -36,13 +37,14 @@ _LOOKED_AT = 1000
 
 def is_secret(name: str) -> bool:
     """Return whether a key or a variable of this name holds a secret, also if it is misspelt."""
-    for word in _WORDS.findall(name[:_LOOKED_AT]):
-        word = word.lower()
-        if word in _WHOLE or word.endswith(_ENDS) or any(part in word for part in _PARTS):
-            return True
-        if difflib.get_close_matches(word, _MISSPELT, n=1, cutoff=_CLOSE):
-            return True
-    return False
+    return any(_is_secret_word(word.lower()) for word in _WORDS.findall(name[:_LOOKED_AT]))
+
+
+@lru_cache(maxsize=4096)  # each store, message and file asks for the same names
+def _is_secret_word(word: str) -> bool:
+    if word in _WHOLE or word.endswith(_ENDS) or any(part in word for part in _PARTS):
+        return True
+    return bool(difflib.get_close_matches(word, _MISSPELT, n=1, cutoff=_CLOSE))
 
 
 def holds_secret(key: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ WITH_VIDEO = {
 
 def protocol(trials: int, video: bool = False) -> dict[str, Any]:
     """Slides that are over in a second, each in a direction of its own."""
-    data: dict[str, Any] = yaml.safe_load(yaml.safe_dump(SMALL))
+    data = copy.deepcopy(SMALL)
     data["name"] = NAME
     collection = data["collection"]
     collection["factors"]["depth"]["values"] = [2.4]
@@ -61,7 +62,8 @@ def protocol(trials: int, video: bool = False) -> dict[str, Any]:
 def run_request(folder: Path, trials: int, video: bool = False) -> RunRequest:
     """Protocol and rig file in `folder`, and a store beside them that may not exist yet."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "protocol.yaml").write_text(yaml.safe_dump(protocol(trials, video)))
+    text = yaml.dump(protocol(trials, video), Dumper=yaml.CSafeDumper)
+    (folder / "protocol.yaml").write_text(text)
     rig = ROOT / "rigs" / "rehearsal.yaml"
     if video:
         rig = folder / "rig.yaml"

@@ -96,7 +96,7 @@ def tiny_gravity() -> dict[str, Any]:
 
 def write(path: Path, data: dict[str, Any]) -> Path:
     """`data` as a YAML file."""
-    path.write_text(yaml.safe_dump(data))
+    path.write_text(yaml.dump(data, Dumper=yaml.CSafeDumper))
     return path
 
 

@@ -36,6 +36,7 @@ OTHER = {"events": "frames", "frames": "events"}
 def take(camera: str, folder: Path, **recording: object) -> None:
     """One short trial of the pilot on the simulated rig that has only this camera."""
     protocol = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
+    protocol["collection"]["motion"][2] |= {"settle": "0.2 s", "duration": "0.5 s"}
     protocol["collection"]["motion"][3]["distance"] = "2 mm"
     protocol["collection"]["recording"]["region"] = {"width": "36 mm", "height": "36 mm"}
     protocol["collection"]["recording"].update(recording)

@@ -22,6 +22,7 @@ from tests.command_line import here
 from tests.crash.campaign import NAME, collect, run_request
 
 TRIALS = 3
+TIMES = [1, pytest.param(2, marks=pytest.mark.long), 10]
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +62,7 @@ def interrupted(wanted: RunRequest) -> Campaign:
     return Store.open(wanted.store).campaign(NAME)
 
 
-@pytest.mark.parametrize("times", [1, 2, 10])
+@pytest.mark.parametrize("times", TIMES)
 @pytest.mark.parametrize(
     ("owner", "name", "at"),
     [
@@ -84,7 +85,7 @@ def test_signal_in_commit_keeps_the_trial(
     assert all(str(item["cause"]).startswith("gate") for item in campaign.quarantined())
 
 
-@pytest.mark.parametrize("times", [1, 2, 10])
+@pytest.mark.parametrize("times", TIMES)
 def test_signal_in_begin_leaves_no_open_trial(
     times: int, wanted: RunRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:

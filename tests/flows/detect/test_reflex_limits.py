@@ -192,7 +192,7 @@ def many(count: int, first: int = 0) -> Counter[str]:
 
 
 def test_no_limit_is_passed_in_many_trials_with_faults() -> None:
-    ended = many(200)
+    ended = many(60)
     assert set(ended) == {"stop", "press", "grip", "no reflex", "safe state", "failed"}
 
 

@@ -214,20 +214,20 @@ def test_what_cannot_be_used_is_said_at_once(
     assert not (taken / "derived" / "labels").exists()
 
 
-@pytest.mark.parametrize("page", ["docs/scale.md", "docs/howto/analyse-on-a-cluster.md"])
-def test_the_commands_of_the_docs_listen_on_this_computer_only(page: str) -> None:
-    text = (ROOT / page).read_text()
+def test_the_commands_of_the_docs_listen_on_this_computer_only() -> None:
+    places = ("docs/scale.md", "docs/howto/analyse-on-a-cluster.md")
+    pages = [(ROOT / place).read_text() for place in places]
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
     started: list[subprocess.Popen[bytes]] = []
     try:
         for kind in ("scheduler", "worker"):
-            found = re.search(rf"^(?:\$ )?dask {kind} .*$", text, re.M)
-            line = found[0].removeprefix("$ ").replace("8786", port).replace("8787", "0")
-            line = re.sub(r"--nworkers \d+", "--nworkers 1", line)
-            command = [sys.executable, "-m", "distributed.cli.dask_" + kind]
-            command += shlex.split(line, comments=True)[2:]
+            found = [re.search(rf"^(?:\$ )?(dask {kind} .*)$", text, re.M)[1] for text in pages]  # type: ignore[index]
+            # both pages have the same command, but for how many workers there are
+            (line,) = {re.sub(r"--nworkers \d+", "--nworkers 1", each) for each in found}
+            words = shlex.split(line.replace("8786", port).replace("8787", "0"), comments=True)
+            command = [sys.executable, "-m", "distributed.cli.dask_" + kind, *words[2:]]
             started.append(
                 subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             )

@@ -31,14 +31,18 @@ RIG = {
 }
 
 
+POOL = "sliplab.plugins.claims.rounds.ProcessPoolExecutor"
+
+
+def thread(workers: int, context: object, initializer: object) -> ThreadPoolExecutor:
+    """A thread in place of a process, which takes seconds to begin."""
+    return ThreadPoolExecutor(workers)
+
+
 @pytest.fixture
 def in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make figures in a thread: a process takes seconds to begin."""
-
-    def thread(workers: int, context: object, initializer: object) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(workers)
-
-    monkeypatch.setattr("sliplab.plugins.claims.rounds.ProcessPoolExecutor", thread)
+    """Make figures in a thread."""
+    monkeypatch.setattr(POOL, thread)
 
 
 def request(
@@ -80,7 +84,9 @@ def record_of(run_request: RunRequest) -> StoppingRecord:
     return StoppingRecord.load(campaign_of(run_request).folder / STOPPING)
 
 
-def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(tmp_path: Path) -> None:
+def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run_request = request(tmp_path / "a", [SURE])
     taken = collect(run_request)
     record = record_of(run_request)
@@ -93,7 +99,8 @@ def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(tmp_path: Path) ->
     assert state.holds
     assert not any(each.holds for look in record.looks[:-1] for each in look.claims)
     assert run_request.due_trials(campaign_of(run_request)) == []
-    # overruled, it goes on to the end, and says so
+    # overruled, it goes on to the end, and says so; the process has been tried
+    monkeypatch.setattr(POOL, thread)
     more = request(tmp_path / "a", [SURE], use="overrule")
     assert len(collect(more)) == 24 - len(taken)
     assert record_of(more).verdict == "overruled"

@@ -197,7 +197,10 @@ ATTACKS = {
 }
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+RUNS_ON = "key of tuples"
+
+
+@pytest.mark.parametrize("name", [it for it in ATTACKS if it != RUNS_ON])
 def test_a_hostile_or_damaged_file_is_refused_at_once(name: str) -> None:
     begun = time.process_time()
     with pytest.raises(InputError) as caught:
@@ -221,7 +224,7 @@ def test_memory_is_limited_for_what_is_small_in_the_file(monkeypatch: pytest.Mon
 
 def test_a_reader_that_runs_on_is_ended() -> None:
     with pytest.raises(InputError, match=r"byte 0: .*more than 3 s or 4 GiB .*ended with code -\d"):
-        parse_pickle(ATTACKS["key of tuples"], "x")
+        parse_pickle(ATTACKS[RUNS_ON], "x")
 
 
 def test_a_reader_that_crashes_harms_nothing(
