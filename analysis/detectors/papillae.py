@@ -1,24 +1,24 @@
 """Slip by what the papillae do: one of them falls silent while the others go on.
 
-While the skin is loaded, the markers of all papillae move in the image, and their edges cause events.
-A tip that slides is loaded no further, so its marker comes to rest: the first sign of slip is that
-one place causes no more events while the others cause as many as before. Nothing is trained, and
-nothing is known of the sensor but its size.
+While the skin is loaded, the markers of all papillae move in the image, and their edges cause
+events. A tip that slides is loaded no further, so its marker comes to rest: the first sign of slip
+is that one place causes no more events while the others cause as many as before. Nothing is
+trained, and nothing is known of the sensor but its size.
 
 Every millisecond:
 
-1. **Places** are cells of the image with more events in the last quarter of a second than noise has,
-   and that touch each other: the ring of a marker's edge, or a part of it. They are found anew every
-   10 ms. Noise is what the median cell has.
-2. A place's **share** is what it had of the events of all places in the last 105 ms, without the last
-   5 ms. What moves all papillae alike leaves the shares as they were.
-3. **Page's test** (Page 1954, Biometrika 41): a place's share of the current millisecond's events is a
-   tenth of what it was, or its noise, against as it was; the likelihoods are binomial. Places that are suspected
-   to be at rest, or that cause twice the events, do not count as the others.
+1. **Places** are cells of the image with more events in the last quarter of a second than noise
+   has, and that touch each other: the ring of a marker's edge, or a part of it. They are found anew
+   every 10 ms. Noise is what the median cell has.
+2. A place's **share** is what it had of all places' events in 100 ms, 5 ms ago. What moves all
+   papillae alike leaves the shares as they were.
+3. **Page's test** (Page 1954, Biometrika 41): a place's share of the current millisecond's events
+   is a tenth of what it was, or its noise, against as it was; the likelihoods are binomial. Places
+   that may be at rest, or that cause twice the events, do not count as the others.
 4. **Dispersion**: the test's statistic is divided by the square of how much more the other places'
    shares vary than by chance (Pearson's statistic per degree of freedom, McCullagh & Nelder 1989,
-   section 4.5). An object that brushes over single papillae changes their shares all the time.
-   The quarter of the places that differ most are left out: they may be the tips that slide.
+   section 4.5). An object that brushes over single papillae changes their shares all the time. The
+   quarter of the places that differ most are left out: they may be the tips that slide.
 
 Evidence is the largest statistic of all places; 0 while fewer than `FEWEST_PLACES` of them move.
 """
@@ -58,10 +58,11 @@ LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
 MOST = 0.95
 """Of a share, so that a place's rate can change."""
-PRIOR_DISPERSION = 3.0
+PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
-REMAINING_MEAN = 0.5
-"""Mean of the lower three quarters of the squares of normal deviates."""
+REMAINING_MEAN = 0.368
+"""Mean of the lower three quarters of the squares of normal deviates: with the distribution function
+F of chi-squared with 3 degrees of freedom, F(1.323) / 0.75."""
 
 F64 = npt.NDArray[np.float64]
 
