@@ -1,0 +1,168 @@
+"""Slip by the silence of single papillae, on drawn events whose rates are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import binom
+
+from sliplab.analysis.detectors.papillae import Papillae, _page
+from sliplab.storage.streams import EventChunk
+
+WIDTH, HEIGHT = 640, 480
+RADIUS_PX, RATE_HZ = 28.0, 4000.0
+CENTRES = [
+    (120 + 100 * column, 90 + 100 * row)
+    for row, columns in enumerate((5, 5, 5, 4))
+    for column in range(columns)
+]
+"""19 markers, 44 pixels between the edges of neighbours."""
+END_S, SLIP_S = 1.2, 0.8
+LEVEL = 20.0
+
+Rates = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
+
+
+def drawn(rng: np.random.Generator, rates: Rates, noise_hz: float = 3000.0) -> EventChunk:
+    """Draw Poisson events on the markers' edges, and noise all over the sensor.
+
+    Args:
+        rates: of times, s, (n,): those of the markers, Hz, (n, 19), at most four times `RATE_HZ`.
+    """
+    most = 4 * RATE_HZ
+    parts = []
+    for marker, (x, y) in enumerate(CENTRES):
+        t = rng.uniform(0, END_S, rng.poisson(most * END_S))
+        t = t[rng.uniform(0, most, len(t)) < rates(t)[:, marker]]
+        angle = rng.uniform(0, 2 * np.pi, len(t))
+        parts.append((t, x + RADIUS_PX * np.cos(angle), y + RADIUS_PX * np.sin(angle)))
+    n = rng.poisson(noise_hz * END_S)
+    parts.append((rng.uniform(0, END_S, n), rng.uniform(0, WIDTH, n), rng.uniform(0, HEIGHT, n)))
+    t, x, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+    order = np.argsort(t)
+    return EventChunk(
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        np.ones(len(t), np.uint8),
+        (1e6 * t[order]).astype(np.int64),
+    )
+
+
+def evidence(events: EventChunk, chunk_us: int = 1_000_000) -> npt.NDArray[np.float64]:
+    """Return the evidence of each millisecond, pushed in chunks."""
+    detector = Papillae()
+    detector.begin(WIDTH, HEIGHT)
+    end_us = round(1e6 * END_S)
+    edges = [*range(0, end_us, chunk_us), end_us]
+    cuts = np.searchsorted(events.t_us, edges)
+    found = [
+        detector.push(events[cuts[k] : cuts[k + 1]], edges[k + 1]) for k in range(len(edges) - 1)
+    ]
+    times = np.concatenate([each.t_us for each in found])
+    assert np.array_equal(times, np.arange(1000, end_us + 1, 1000))
+    return np.concatenate([each.value for each in found])
+
+
+def moving(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers move alike from 0.3 s on."""
+    return np.where(t[:, None] > 0.3, RATE_HZ, 0.0) * np.ones(len(CENTRES))
+
+
+def one_stops(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The last marker comes to rest."""
+    rates = moving(t)
+    rates[t > SLIP_S, -1] = 0.0
+    return rates
+
+
+def slower(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers move at a third, as when the arm slows down."""
+    return moving(t) * np.where(t > SLIP_S, 1 / 3, 1.0)[:, None]
+
+
+def stopping(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers come to rest within 50 ms, as when the arm stops."""
+    return moving(t) * np.clip((SLIP_S + 0.05 - t) / 0.05, 0, 1)[:, None]
+
+
+def shaken(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers swing at 15 Hz, and the swing dies away, as after a knock."""
+    swing = 3 * np.abs(np.sin(2 * np.pi * 15 * t)) * np.exp(-np.maximum(t - SLIP_S, 0) / 0.1)
+    return moving(t) * np.where(t > SLIP_S, 1 + swing, 1.0)[:, None]
+
+
+def brushed(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """An object pushes one marker after the other; the skin itself rests."""
+    places = np.array(CENTRES)[:, 0] / 100 + np.array(CENTRES)[:, 1] / 400
+    front = 12 * (t[:, None] - 0.2) - places
+    return RATE_HZ * np.exp(-(front**2) / 0.5)
+
+
+def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Noise alone."""
+    return np.zeros((len(t), len(CENTRES)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 15), (60000.0, 25)])
+def test_a_marker_that_comes_to_rest_is_seen_at_once(
+    seed: int, noise_hz: float, within_ms: int
+) -> None:
+    value = evidence(drawn(np.random.default_rng(seed), one_stops, noise_hz))
+    slip_ms = round(1000 * SLIP_S)
+    assert value[:slip_ms].max() < LEVEL
+    assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
+
+
+@pytest.mark.parametrize("rates", [moving, slower, stopping, shaken, brushed, still])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_moves_all_alike_and_what_pushes_single_ones_is_no_slip(
+    rates: Rates, seed: int
+) -> None:
+    assert evidence(drawn(np.random.default_rng(seed), rates)).max() < LEVEL
+
+
+def test_hot_pixels_that_go_out_are_no_slip() -> None:
+    rng = np.random.default_rng(3)
+    events = drawn(rng, moving)
+    hot_us = np.sort(rng.integers(0, 800_000, 4000))
+    places = rng.integers(0, 8, 4000)
+    every = np.concatenate([events.t_us, hot_us])
+    order = np.argsort(every, kind="stable")
+    joined = EventChunk(
+        np.concatenate([events.x, (40 + 70 * places).astype(np.uint16)])[order],
+        np.concatenate([events.y, np.full(4000, 20, np.uint16)])[order],
+        np.ones(len(every), np.uint8),
+        every[order],
+    )
+    assert evidence(joined).max() < LEVEL
+
+
+@pytest.mark.parametrize("chunk_us", [1000, 7300, 10_000, 333_333])
+def test_evidence_is_the_same_to_the_bit_in_any_chunks(chunk_us: int) -> None:
+    events = drawn(np.random.default_rng(1), one_stops)
+    whole = evidence(events)
+    assert whole.max() > LEVEL
+    assert np.array_equal(evidence(events, chunk_us), whole)
+
+
+def test_a_scene_leaves_nothing_to_the_next() -> None:
+    first, second = (drawn(np.random.default_rng(seed), one_stops) for seed in (1, 2))
+    detector = Papillae()
+    found = []
+    for events in (first, second):
+        detector.begin(WIDTH, HEIGHT)
+        found.append(detector.push(events, round(1e6 * END_S)).value)
+    assert np.array_equal(found[1], evidence(second))
+
+
+def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
+    n, total, share, ratio = np.array([0.0, 3.0, 9.0]), np.array([40.0, 41.0, 50.0]), 0.1, 0.25
+    expected = binom.logpmf(n, total, ratio * share) - binom.logpmf(n, total, share)
+    before = np.full(3, 50.0)  # so far from 0 that nothing is cut off
+    after = _page(before, ratio, n, total, np.full(3, share))
+    np.testing.assert_allclose(after - before, expected, rtol=1e-12)
+    assert (_page(np.zeros(3), ratio, np.full(3, 9.0), total, np.full(3, share)) == 0.0).all()
