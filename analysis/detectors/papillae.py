@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sliplab.plugins.bench.interface import Cost, Detector, Evidence
+from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
 from sliplab.storage.streams import EventChunk
 
 BIN_US = 1000
@@ -61,8 +61,8 @@ MOST = 0.95
 PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
 REMAINING_MEAN = 0.368
-"""Mean of the lower three quarters of the squares of normal deviates: with the distribution function
-F of chi-squared with 3 degrees of freedom, F(1.323) / 0.75."""
+"""Mean of the lower three quarters of squared normal deviates: F(1.323) / 0.75, with F of chi-squared
+with 3 degrees of freedom."""
 
 F64 = npt.NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 A detector is named by
 
-- a name that a plug-in declares, or one of the entry point group `sliplab.detectors`;
+- a name of `CORE`, that a plug-in declares, or of the entry point group `sliplab.detectors`;
 - ``module:attribute``, a class or function that takes no argument and returns a `Detector`;
 - the path of an ONNX file, or ``run:COMMAND``, a program that reads standard input and answers on
   output; the plug-in `bench` runs both.
@@ -27,13 +27,14 @@ from sliplab.protocols.shown import did_you_mean
 
 GROUP = "sliplab.detectors"
 PROGRAM, ONNX = "run:", ".onnx"
+CORE = {"papillae": "sliplab.analysis.detectors.papillae:Papillae"}
 _KEY = "DETECTOR"
 
 
 def known() -> dict[str, str]:
     """Return ``module:attribute`` by name; another package cannot replace a shipped detector."""
     pointed = {point.name: point.value for point in entry_points(group=GROUP)}
-    return pointed | plugins().declared("detectors")
+    return pointed | plugins().declared("detectors") | CORE
 
 
 def is_known(name: str) -> bool:
