@@ -61,8 +61,8 @@ MOST = 0.95
 PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
 REMAINING_MEAN = 0.368
-"""Mean of the lower three quarters of squared normal deviates: F(1.323) / 0.75, with F of chi-squared
-with 3 degrees of freedom."""
+"""Mean of the lower three quarters of squared normal deviates: F(1.323) / 0.75, with F the
+distribution function of chi-squared with 3 degrees of freedom."""
 
 F64 = npt.NDArray[np.float64]
 

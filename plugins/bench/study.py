@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sliplab.analysis.detectors.registry import CORE
 from sliplab.analysis.study import Finding, Study
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, MedianLatency
 from sliplab.protocols.errors import InputError
@@ -69,7 +70,7 @@ def measure(
 
     if leaderboard is not None:
         _around(leaderboard)  # wrong input fails before anything is simulated
-    size, names = "small" if small else "full", detectors or tuple(PLUGIN.detectors)
+    size, names = "small" if small else "full", detectors or (*CORE, *PLUGIN.detectors)
     found = run_bench(names, size, seed, folder, workers or os.cpu_count() or 1)
     svg = latency_against_alarms(found)
     if leaderboard is not None:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
-from sliplab.analysis.detectors.papillae import Papillae, _page
+from sliplab.analysis.detectors.papillae import REMAINING_MEAN, Papillae, _page
 from sliplab.storage.streams import EventChunk
 
 WIDTH, HEIGHT = 640, 480
@@ -21,7 +21,7 @@ CENTRES = [
 ]
 """19 markers, 44 pixels between the edges of neighbours."""
 END_S, SLIP_S = 1.2, 0.8
-LEVEL = 20.0
+LEVEL = 11.0
 
 Rates = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
 
@@ -166,3 +166,8 @@ def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
     after = _page(before, ratio, n, total, np.full(3, share))
     np.testing.assert_allclose(after - before, expected, rtol=1e-12)
     assert (_page(np.zeros(3), ratio, np.full(3, 9.0), total, np.full(3, share)) == 0.0).all()
+
+
+def test_the_mean_of_the_remaining_squares_is_that_of_normal_deviates() -> None:
+    most = chi2.ppf(0.75, 1)
+    assert pytest.approx(chi2.expect(lambda x: x, (1,), ub=most) / 0.75, abs=1e-3) == REMAINING_MEAN

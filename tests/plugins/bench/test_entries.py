@@ -15,11 +15,10 @@ from scipy.special import softmax
 from sliplab.analysis.detectors.detector import DetectorError, Scene
 from sliplab.analysis.detectors.detectors import Predictions
 from sliplab.analysis.detectors.feeding import feed
-from sliplab.analysis.detectors.registry import contents, make_detector
+from sliplab.analysis.detectors.registry import contents, known, make_detector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import INCIPIENT
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench import PLUGIN
 from sliplab.plugins.bench.audit import audit
 from sliplab.plugins.bench.entries.hyperdimensional import Hyperdimensional
 from sliplab.plugins.bench.entries.network import PaperEntry
@@ -254,7 +253,7 @@ def test_what_a_name_means_is_hashed(tmp_path: Path) -> None:
 
 
 def test_shipped_detectors_can_be_made() -> None:
-    for name in PLUGIN.detectors:
+    for name in known():
         make_detector(name).begin(640, 480)
 
 
