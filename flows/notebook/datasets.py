@@ -15,8 +15,9 @@ from sliplab.analysis.windows.window_table import whole_ns
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of, plural
 from sliplab.protocols.windows import Windows
+from sliplab.storage.errors import NoTrial
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import NoTrial, Store
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     import pandas as pd
