@@ -397,6 +397,8 @@ def same_rig(one: str, other: str, *, skin: str | None = None) -> bool:
     """
     if one == other:
         return True
+    first: dict[str, Any]
+    second: dict[str, Any]
     first, second = (parse_yaml(text, "rig.yaml") for text in (one, other))
     if skin is not None:
         before, now = (data["skin"].get("serial") for data in (first, second))

@@ -336,7 +336,7 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     if issubclass(SCHEDULED[flow], OnRig):
         parameters["timezone"] = timezone
     if flow == "push" and not model.url:
-        raise InputError(path, "url", model.url, "is missing; give one like s3://bucket/folder")
+        raise InputError(path, "url", None, "is missing; give one like s3://bucket/folder")
     if "protocol" in parameters:
         parameters["protocol"] = _protocol(path, model.protocol, model.enable)
         _check_campaign(path, model.campaign)

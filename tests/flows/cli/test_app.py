@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from sliplab.flows.cli import errors
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
@@ -176,3 +177,14 @@ def test_collect_takes_so_many_trials_and_no_more(tmp_path: Path) -> None:
         assert (found["taken"], found["left_out"]) == (taken, left_out)
     assert (found["committed"], found["missing"]) == (3, 33)
     assert here("collect", *arguments, "--trials", 0).returncode == 2
+
+
+@pytest.mark.parametrize("command", ["status", "alerts"])
+def test_a_command_that_only_watches_ends_in_plain_words(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["sliplab", command, "store"])
+    ended = errors.interruption()
+    assert ended.exit_code == 130
+    assert ended.message.startswith("interrupted: no longer watching")
+    assert "half-written" not in ended.message
