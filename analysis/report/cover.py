@@ -79,7 +79,7 @@ def slip_answer(summary: Summary | OneCameraSummary) -> Answer:
         sentences.append(
             f"{title}: {found.accounted.detected_first} of "
             f"{plural(found.accounted.planned, 'test trial')} detected before gross slip. "
-            f"Medians: {late} after the onset, {lead} before gross slip (95 % intervals)."
+            f"Medians (95 % intervals): {late} after the onset, {lead} before gross slip."
         )
     if not groups:
         return Answer((), None)

@@ -22,6 +22,7 @@ from sliplab.analysis.report import campaign, outcomes
 from sliplab.analysis.report.against import Change, compare
 from sliplab.analysis.report.outcomes import MOST_FAILURES, account, failure_section, trial_outcome
 from sliplab.analysis.report.page import render_section, write_figures
+from sliplab.analysis.report.paper import paper_section
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
@@ -225,11 +226,26 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
         else:
             assert (folder / address).is_file()
     for said in (
+        *("88 ms after onset", "measured by its authors on their own robot", "here (simulated)"),
         *(f"sliplab {command} {store.folder.resolve()}" for command in ("review", "generalise")),
         "No campaign has reference trials",
     ):
         assert said in text
-    assert "Comparison with the paper" not in text  # no protocol asks for its preset
+
+
+def test_only_the_papers_preset_brings_the_papers_figures(store: Store) -> None:
+    summary = read_summary(store)
+    known = paper_section(summary)
+    assert known is not None
+    assert known.rows.columns[:2] == ["figure", "paper"]
+    others = {"lab": changed(summary.networks["preset-paper"], preset=None, title="lab.pt")}
+    among = paper_section(changed(summary, networks=others))
+    assert among is not None
+    assert among.rows.columns == ["figure", "here (simulated)", "lab.pt (simulated)"]
+    made = render_section(among, simulated=True)
+    assert made.title == "Comparison of networks"
+    assert "88 ms" not in made.html
+    assert paper_section(changed(summary, networks={})) is None
 
 
 def test_failures_have_a_command_that_shows_them(store: Store) -> None:

@@ -50,7 +50,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("name", ["index.html", "against.html"])
-@pytest.mark.parametrize("width", [1400, 420, PAPER_PX])
+@pytest.mark.parametrize("width", [1400, 390, PAPER_PX])
 def test_a_page_fits_and_is_whole(browser: Any, folder: Path, name: str, width: int) -> None:
     page = browser.new_page(viewport={"width": width, "height": 900})
     page.set_default_timeout(PATIENCE_MS)
@@ -63,6 +63,9 @@ def test_a_page_fits_and_is_whole(browser: Any, folder: Path, name: str, width: 
     page.on("request", lambda request: asked.append(request.url))
     page.goto((folder / name).as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+    if width != PAPER_PX:  # on paper nothing is folded
+        page.evaluate("document.querySelectorAll('details').forEach((e) => e.open = true)")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert page.evaluate(OUTSIDE) == []
     assert page.evaluate(EMPTY) == []
     assert page.locator("figure").count() > (10 if name == "index.html" else 0)
@@ -73,3 +76,29 @@ def test_a_page_fits_and_is_whole(browser: Any, folder: Path, name: str, width: 
     assert [url for url in asked if url.startswith(("http", "file"))] == [page.url]
     assert amiss == []
     page.close()
+
+
+LOWEST = """() => Math.max(...['h1', '#answer', '#failed'].map(
+  (name) => document.querySelector(name).getBoundingClientRect().bottom))"""
+INK = """() => [document.body, document.querySelector('#answer svg text')].map(
+  (e, k) => getComputedStyle(e)[k ? 'fill' : 'backgroundColor'])"""
+"""Colours of the ground and of a figure's text."""
+
+
+def test_first_screen_answers_in_light_and_dark(browser: Any, folder: Path) -> None:
+    grounds, inks = set(), set()
+    for scheme in ("light", "dark"):
+        page = browser.new_page(viewport={"width": 1400, "height": 900}, color_scheme=scheme)
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto((folder / "index.html").as_uri())
+        assert page.evaluate(LOWEST) <= 900
+        ground, ink = page.evaluate(INK)
+        assert ground != ink
+        grounds.add(ground)
+        inks.add(ink)
+        first = page.locator("details.section").first
+        first.locator("summary").focus()
+        page.keyboard.press("Enter")
+        assert first.locator("section").is_visible()
+        page.close()
+    assert len(grounds) == len(inks) == 2
