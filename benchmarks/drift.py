@@ -24,6 +24,7 @@ from sliplab.plugins.twin.statistics import of_names
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_specimen, simulated
 from sliplab.protocols import load_plan
 from sliplab.protocols.shipped import shipped_protocols
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -65,7 +66,7 @@ def main() -> None:
     for number in range(asked.campaigns):
         fall = FALL if number % 3 == 2 else 1.0
         specimen = int(rng.integers(2**31))
-        values = drawn(rig.scene, prior.parameters, SPECIMENS, rng)
+        values = drawn(scene_of(rig), prior.parameters, SPECIMENS, rng)
         observed = []
         for trial, share in zip(trials, along, strict=True):
             now = {**values, FRICTION: values[FRICTION] * fall**share}

@@ -41,7 +41,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings, skin_of
+from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
 from sliplab.rigs.scene.slides import run_slide
 
 F64 = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ QUANTILES = {"median": 0.5, "p05": 0.05, "p90": 0.9}
 
 def world(number: int, seed: int) -> MockSettings:
     """Return the settings of a simulated rig."""
-    return prior_of(CLEAN, seed).world(number, pilot_slides()).rig.scene
+    return scene_of(prior_of(CLEAN, seed).world(number, pilot_slides()).rig)
 
 
 def figures(settings: MockSettings, grid: TrialGrid, times: int) -> dict[str, F64]:

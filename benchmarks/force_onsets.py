@@ -17,7 +17,7 @@ import numpy as np
 from sliplab.analysis.force import PlateForces
 from sliplab.analysis.labels.force_onsets import force_onsets
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import skin_of
+from sliplab.rigs.mock.settings import scene_of, skin_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.rigs.scene.contact import advance
@@ -66,8 +66,8 @@ def _run(springs: Springs, tips: Tips, path: F64, step_s: float) -> tuple[F64, F
 def slide(depth_mm: float, speed_mm_s: float, seed: int) -> SlideOnsets:
     """Press, hold and slide; return the onsets."""
     rig, _ = load_rig_file(shipped_rigs()["mock_force"])
-    skin = skin_of(rig.scene)
-    springs, n = springs_of(rig.scene, skin, seed), len(skin)
+    skin = skin_of(scene_of(rig))
+    springs, n = springs_of(scene_of(rig), skin, seed), len(skin)
     tips = new_tips(n)
     down = np.linspace(0, depth_mm, 101)[1:]
     _run(springs, tips, np.stack([0 * down, 0 * down, down], 1), depth_mm / PRESS_MM_S / 100)

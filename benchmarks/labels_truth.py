@@ -36,6 +36,7 @@ from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.faults import MarkerOccluded
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import Chunk, FrameChunk, Json
 
@@ -111,7 +112,7 @@ def check(job: tuple[RigFile, Plan, Trial, dict[str, Any], bool]) -> Checked:
         (0, int(frame_ns[-1])),
         Labelling(),
         centre=0,
-        exposure_ns=2 * rig.scene.frame_camera.exposure_us * 500,
+        exposure_ns=2 * scene_of(rig).frame_camera.exposure_us * 500,
         source="video",
     )
     off = markers.xy - np.concatenate(true.places)

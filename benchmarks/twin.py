@@ -50,7 +50,7 @@ from sliplab.plugins.twin.statistics import SlideStatistics, of_names, statistic
 from sliplab.plugins.twin.worlds import DrawnWorld, Prior, Slides
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.core import faults
-from sliplab.rigs.mock.settings import MockEventCameraSettings
+from sliplab.rigs.mock.settings import MockEventCameraSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64
@@ -141,7 +141,7 @@ def world_of(job: WorldJob) -> DrawnWorld:
         return prior.world(LATER + job.number, pilot_slides())
     world = prior.world(job.number, pilot_slides())
     if job.kind == "a tilted plate":
-        tilt_deg = prior.rig.scene.scene.contact.tilt_deg + TILT_DEG
+        tilt_deg = scene_of(prior.rig).scene.contact.tilt_deg + TILT_DEG
         made = changed(world.rig, {"scene": {"contact": {"tilt_deg": tilt_deg}}})
     else:
         rng = np.random.default_rng([prior.seed, job.number, 1])
@@ -177,10 +177,10 @@ def slides_of(job: WorldJob, world: DrawnWorld) -> list[PilotTrial]:
     if job.kind in DRIFTS:
         key, trials = DRIFTS[job.kind], world.slides.trials
         (it,) = (one for one in PARAMETERS if one.key == key)
-        value, found = value_of(world.rig.scene, it), []
+        value, found = value_of(scene_of(world.rig), it), []
         for number, trial in enumerate(trials):
             worn = value * (1.0 + DRIFT * number / (len(trials) - 1))
-            rig = changed(world.rig, settings_of(world.rig.scene, {key: worn}))
+            rig = changed(world.rig, settings_of(scene_of(world.rig), {key: worn}))
             with_events = trial.id in world.slides.with_events
             found += simulate_pilot(rig, world.slides.plan, [trial], world.seed, with_events)
         return found

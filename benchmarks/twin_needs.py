@@ -24,7 +24,7 @@ from sliplab.plugins.twin.needs.judging import Marked, Need, marked, marks, need
 from sliplab.plugins.twin.parameters import PARAMETERS, value_of
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.settings import Papilla, skin_of
+from sliplab.rigs.mock.settings import Papilla, scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import Json
@@ -46,7 +46,7 @@ def slides() -> Slides:
 
 def papillae(rig: RigFile, rng: np.random.Generator | None) -> tuple[Papilla, ...]:
     """Return a rig's papillae as they are, or as somebody measured them."""
-    skin, design = skin_of(rig.scene), np.array(rig.skin.layout_mm())
+    skin, design = skin_of(scene_of(rig)), np.array(rig.skin.layout_mm())
     error = np.zeros((len(skin), 4)) if rng is None else rng.standard_normal((len(skin), 4))
     aside = skin.layout_mm - design + PLACE_MM * error[:, 2:]
     return tuple(
@@ -71,7 +71,7 @@ def rigs(
     for _ in range(count):
         values = {}
         for it in PARAMETERS:
-            own = value_of(rig.scene, it)
+            own = value_of(scene_of(rig), it)
             if own > 0.0:
                 factor = float(np.exp(LEFT_OPEN * rng.standard_normal()))
                 values[it.key] = min(own * factor, it.most)
@@ -130,7 +130,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     both = shown(worlds, {}), shown(pilots, {})
     keys = [key for key in wanted.only.split(",") if key]
-    for effect in effects_of(rig.scene):
+    for effect in effects_of(scene_of(rig)):
         if keys and effect.key not in keys:
             continue
         beside = effect.beside

@@ -59,6 +59,7 @@ from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import read_json, write_json
@@ -182,7 +183,7 @@ def hidden_rig(folder: Path, assumed: Path, seed: int, number: int) -> Path:
     data = {
         "extends": str(assumed),
         "name": "hidden",
-        "mock": world.scene.model_dump(mode="json"),
+        "mock": scene_of(world).model_dump(mode="json"),
         # a lab measures it
         "calibration": {"touch_depth": f"{touch_depth_mm(world):.3f} mm"},
     }

@@ -20,7 +20,7 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
-from sliplab.rigs.mock.settings import ClockErrors
+from sliplab.rigs.mock.settings import ClockErrors, scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import Chunk, EventChunk, NullSink
 
@@ -64,7 +64,7 @@ class SceneRun:
 
 def changed(rig: RigFile, values: Mapping[str, Any]) -> RigFile:
     """Return a simulated rig's file with other settings of `mock`, nested mappings, unchecked."""
-    return rig.model_copy(update={"mock": _changed(rig.scene, values)})
+    return rig.model_copy(update={"mock": _changed(scene_of(rig), values)})
 
 
 def _changed(model: Any, values: Mapping[str, Any]) -> Any:
@@ -77,7 +77,7 @@ def _changed(model: Any, values: Mapping[str, Any]) -> Any:
 
 def with_true_times(rig: RigFile, with_faults: bool = False) -> RigFile:
     """Return the rig with perfect clocks and, by default, no faults."""
-    return changed(rig, {"clocks": PERFECT, "faults": rig.scene.faults if with_faults else ()})
+    return changed(rig, {"clocks": PERFECT, "faults": scene_of(rig).faults if with_faults else ()})
 
 
 def ideal(rig: RigFile) -> RigFile:

@@ -273,17 +273,6 @@ class RigFile(StrictModel):
         return section
 
     @property
-    def scene(self) -> Any:
-        """The simulated scene and devices, by the model that the driver `mock` declares.
-
-        Raises:
-            ValueError: a real rig has none.
-        """
-        if self.mock is None:
-            raise ValueError(f"the rig {self.name} is real: there is no simulated scene")
-        return self.mock
-
-    @property
     def has_plate(self) -> bool:
         """True if the plate hangs on a slider that can be raised, released and caught."""
         return self.simulated or (self.devices is not None and self.devices.plate is not None)

@@ -21,7 +21,7 @@ from sliplab.analysis.sweeps.runner import Sweep, SweepTask, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store
 
@@ -78,7 +78,7 @@ def guess_sweep(work: StudySensitivity, guesses: Sequence[str]) -> Sweep[SweepTa
         InputError: there is no such parameter, or it is switched off.
     """
     rigs = ((item, item.campaign.folder / "rig.yaml") for item in work.campaigns)
-    scenes = {item.name: load_rig_file(path, stored=True)[0].scene for item, path in rigs}
+    scenes = {item.name: scene_of(load_rig_file(path, stored=True)[0]) for item, path in rigs}
     there = in_all(guesses, list(scenes.values()))
     for name in guesses:
         if name not in there:

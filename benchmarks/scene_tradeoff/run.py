@@ -30,6 +30,7 @@ from sliplab.flows.scene_runs import changed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.mock.levels import at_level, choose_level
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
 
@@ -68,7 +69,7 @@ def tradeoff_scene(
         raise InputError("--rig", "", str(rig_path), "must be a simulated rig: it has the scene")
     check_plan(rig, plan, str(rig_path))
     # while a plate may fall the contact steps by a millisecond whatever the rig file says
-    falls, stated = plan.protocol.collection.plate is not None, rig.scene.scene.step_ms
+    falls, stated = plan.protocol.collection.plate is not None, scene_of(rig).scene.step_ms
     families = make_families(stated, (stated,) if falls else steps)
     jobs = [VariantJob(rig, plan, trial, families) for trial in sample_trials(plan, trials)]
     count = len(variants(families))

@@ -21,7 +21,7 @@ from sliplab.flows.scene_runs import SceneRun, changed, ideal, run, timed
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.mock.levels import HIGHEST, expected_onsets, slides_of
-from sliplab.rigs.mock.settings import skin_of
+from sliplab.rigs.mock.settings import scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
 
@@ -34,7 +34,7 @@ def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
     start = perf_counter()
     slides = slides_of(replace(plan, trials=(trial,)))
     if slides:
-        onsets = expected_onsets(rig.scene, slides, HIGHEST)[0]
+        onsets = expected_onsets(scene_of(rig), slides, HIGHEST)[0]
     else:
         mass_kg, steps = plan.mass_kg(trial), plan.program(trial).steps
         moves = [step for step in steps if isinstance(step, Move)]
@@ -44,12 +44,12 @@ def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
             return None
         onsets = np.array(
             retraction_onsets(
-                skin_of(rig.scene),
-                rig.scene.scene.friction.kinetic,
+                skin_of(scene_of(rig)),
+                scene_of(rig).scene.friction.kinetic,
                 mass_kg,
                 pressed.depth_mm,
                 pulled.speed_mm_s,
-                rig.scene.scene.plate.gravity_m_s2,
+                scene_of(rig).scene.plate.gravity_m_s2,
             )
         )
     seconds = perf_counter() - start

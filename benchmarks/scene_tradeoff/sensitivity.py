@@ -23,7 +23,7 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.mock.levels import HIGHEST, slides_of, with_level
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings, skin_of
+from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.slides import run_slide
 
@@ -59,7 +59,7 @@ def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Scene
         advance: called after each whole run.
     """
     rig, plan, analysis = job.rig, job.plan, job.plan.protocol.analysis
-    variant = Variant(HIGHEST, rig.scene.scene.step_ms, other_seed=job.other_seed)
+    variant = Variant(HIGHEST, scene_of(rig).scene.step_ms, other_seed=job.other_seed)
     seen: list[SceneRun] = []
     counted: list[SceneWindows] = []
     for trial in job.trials[:EVENT_TRIALS]:
@@ -70,7 +70,7 @@ def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Scene
     rates = pooled(counted)["events_per_s"]
     if job.known is not None:
         return SceneOutcome(job.known.onsets_s, rates)
-    onsets = [_slide_onsets(rig.scene, plan, t, variant.seed(t)) for t in job.trials]
+    onsets = [_slide_onsets(scene_of(rig), plan, t, variant.seed(t)) for t in job.trials]
     slides = [onset for onset in onsets if onset is not None]
     # a falling plate has no contact-only run: its whole runs are taken
     known = slides or [_seen_onsets(item) for item in seen]
@@ -121,13 +121,13 @@ def measure_sensitivity(
     trials = sample_trials(plan, CONTACT_TRIALS)
     base = outcome(OutcomeJob(rig, plan, trials), advance)
     names = assumed.CONTACT + assumed.CAMERA
-    values = {name: assumed.value_of(rig.scene, name) for name in names}
+    values = {name: assumed.value_of(scene_of(rig), name) for name in names}
     other_seed = assumed.ParameterSetting()
     jobs = {other_seed: OutcomeJob(rig, plan, trials, other_seed=True)}
     # without a rigid base, or something else that is switched off
     for setting in assumed.lower_and_higher([name for name, value in values.items() if value]):
         known = base if setting.parameter in assumed.CAMERA else None
-        other = changed(rig, setting.change(rig.scene))
+        other = changed(rig, setting.change(scene_of(rig)))
         jobs[setting] = OutcomeJob(other, plan, trials, known=known)
     if each is None:
         made = [outcome(job, advance) for job in jobs.values()]

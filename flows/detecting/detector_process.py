@@ -114,11 +114,11 @@ def serve_detector(fd: int, name: str, level: float | None, store: str | None) -
     with suppress(EOFError, OSError):
         try:
             # only here, because the parent needs no second copy
+            from sliplab.analysis.detectors.named import named_detector
             from sliplab.analysis.networks import training
-            from sliplab.flows.detecting.sources import NamedSource
 
             training.limit_threads(1)
-            made = NamedSource(name, level, None if store is None else Path(store)).detector()
+            made = named_detector(name, level, None if store is None else Path(store))
         except Exception as error:
             pipe.send((False, str(error)))
             os._exit(1)

@@ -13,16 +13,15 @@ from pathlib import Path
 from typing import TypeAlias
 
 from sliplab.analysis.detectors.at_level import AtLevel
-from sliplab.analysis.detectors.detector import Detector, StreamDetector
+from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.detectors import Tuned
+from sliplab.analysis.detectors.named import named_detector, needs_training
 from sliplab.analysis.detectors.network_detector import Counting, NetworkDetector, counting_of
 from sliplab.analysis.detectors.registry import make_detector
-from sliplab.analysis.detectors.stored_scenes import fitted_to
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.detector_process import DetectorProcess, NetworkProcess
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
-from sliplab.storage.trials.store import Store
 
 
 @dataclass(frozen=True)
@@ -110,23 +109,8 @@ class NamedSource:
         return
 
     def detector(self) -> AtLevel:
-        """Return the detector in this process, trained and at its level.
-
-        Raises:
-            InputError: there is none of the name.
-            StoreError: see `fitted_to`.
-            DetectorError: it cannot be trained.
-        """
-        made = make_detector(self.name)
-        try:
-            if self.level is not None and not needs_training(made):
-                return AtLevel(made, self.level)
-            assert self.store is not None, "the request was checked"
-            fitted = fitted_to(Store(self.store), made)
-            return fitted if self.level is None else AtLevel(made, self.level)
-        except BaseException:
-            made.close()
-            raise
+        """Return the detector in this process; see `named_detector`."""
+        return named_detector(self.name, self.level, self.store)
 
     @contextmanager
     def running(
@@ -146,11 +130,6 @@ class NamedSource:
 
 
 Source: TypeAlias = NetworkSource | NamedSource
-
-
-def needs_training(detector: Detector) -> bool:
-    """Return whether a detector's class trains it."""
-    return type(detector).train is not Detector.train
 
 
 def named_source(name: str, level: float | None, store: Path | None) -> NamedSource:

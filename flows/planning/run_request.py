@@ -32,6 +32,7 @@ from sliplab.protocols.yaml_file import (
     without_secrets,
 )
 from sliplab.rigs.mock.levels import at_level, with_level
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.context import SKIN, LoggedContext
@@ -300,7 +301,7 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
         "rig": run_request.rig.name,
         "rig_hash": rig_hash(run_request.rig_text),
         "simulated": run_request.rig.simulated,
-        "scene_level": run_request.rig.scene.scene.level if run_request.rig.simulated else None,
+        "scene_level": scene_of(run_request.rig).scene.level if run_request.rig.simulated else None,
         "enabled": list(run_request.enable),
     }
     file = run_request.plan.file

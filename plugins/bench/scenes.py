@@ -19,6 +19,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.faults import AnyFault
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import EventChunk
@@ -73,7 +74,7 @@ def nuisance_scenes(size: Size, seed: int) -> dict[str, list[SceneDraw]]:
             hold_s = _value(DEFINITION.nuisance_hold_s, rng)
             chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
             rig = _world(drawn_by, number)
-            faults = nuisance_faults(name, hold_s, rig.scene, chance)
+            faults = nuisance_faults(name, hold_s, scene_of(rig), chance)
             world = f"nuisances {number + 1}"
             found[name].append(_drawn(f"{name} {number + 1}", world, rig, hold_s, rng, faults))
     return found
@@ -112,7 +113,7 @@ def _drawn(
     rng: np.random.Generator,
     faults: tuple[AnyFault, ...] = (),
 ) -> SceneDraw:
-    heights_mm = rig.scene.scene.skin.heights_mm
+    heights_mm = scene_of(rig).scene.skin.heights_mm
     touching_mm = max(heights_mm) - min(heights_mm)
     return SceneDraw(
         name,

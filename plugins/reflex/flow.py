@@ -34,6 +34,7 @@ from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.streams import EventChunk, Json
 
@@ -200,7 +201,7 @@ def _builder(file: RigFile) -> Iterator[BuildRig]:
     from sliplab.rigs.loopback.client import Loopback
 
     assert file.devices is not None
-    stage = Loopback(file.scene, file.timing, file.devices, file.streams)
+    stage = Loopback(scene_of(file), file.timing, file.devices, file.streams)
     try:
         yield lambda rig, should_stop: loopback_rig(rig, stage, should_stop)
     finally:

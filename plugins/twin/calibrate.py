@@ -49,7 +49,7 @@ from sliplab.plugins.twin.worlds import (
     touch_section,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import Papilla
+from sliplab.rigs.mock.settings import Papilla, scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import ConditionRange, FittedValue, TwinRecord
@@ -176,7 +176,7 @@ def with_tracking_noise(rig: RigFile, pilot: PilotSlides) -> RigFile:
     It is measured, not fitted: a marker that sticks moves by nothing else.
     """
     slips = find_slips([pilot.slides[trial.id] for trial in pilot.fitted])
-    camera = rig.scene.frame_camera
+    camera = scene_of(rig).frame_camera
     if slips is None:
         return rig
     noise_px = float(np.median(slips.noise_mm)) * camera.px_per_mm
@@ -289,7 +289,7 @@ def measured_papillae(rig: RigFile, pilot: PilotSlides) -> tuple[Papilla, ...] |
     if found is None or len(found.gap_mm) != len(design):
         return None
     place = found.place_mm - np.median(found.place_mm - design, axis=0)
-    height = rig.scene.scene.skin.heights_mm[0] - found.gap_mm
+    height = scene_of(rig).scene.skin.heights_mm[0] - found.gap_mm
     if not np.isfinite([*height, *found.friction, *place.ravel()]).all():
         return None
     return tuple(
@@ -356,7 +356,7 @@ def parameter_fits(
     for it, estimate in zip(
         known, widened(scene.found, slopes, math.log1p(gain_error)), strict=True
     ):
-        assumed = value_of(rig.scene, it)
+        assumed = value_of(scene_of(rig), it)
         low, high, least, most = np.exp(
             [estimate.low, estimate.high, estimate.prior_low, estimate.prior_high]
         )
@@ -400,10 +400,10 @@ def seen_statistics(scene: SceneFit) -> dict[str, StatisticSeen]:
 def write_twin(wanted: FitRequest, scene: SceneFit, record: TwinRecord) -> None:
     """Write the twin's rig file, which extends the one that was fitted."""
     rounded = {key: _rounded(value) for key, value in scene.values.items()}
-    mock = settings_of(wanted.rig.scene, rounded)
+    mock = settings_of(scene_of(wanted.rig), rounded)
     mock.setdefault("scene", {})["level"] = LEVEL
-    noise_px = scene.prior.rig.scene.frame_camera.centroid_noise_px
-    if noise_px != wanted.rig.scene.frame_camera.centroid_noise_px:
+    noise_px = scene_of(scene.prior.rig).frame_camera.centroid_noise_px
+    if noise_px != scene_of(wanted.rig).frame_camera.centroid_noise_px:
         mock["frame_camera"] = {"centroid_noise_px": noise_px}
     skin = mock["scene"].setdefault("skin", {})
     if scene.skin:

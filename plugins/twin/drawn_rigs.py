@@ -19,6 +19,7 @@ from sliplab.plugins.twin.parameters import settings_of
 from sliplab.plugins.twin.posterior import Posterior
 from sliplab.plugins.twin.worlds import touch_section
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_bytes, write_text
@@ -61,7 +62,7 @@ def read_samples(path: Path, count: int) -> list[dict[str, float]]:
 def write_drawn(twin: Path, values: Mapping[str, float], out: Path) -> None:
     """Write the rig file of one sample, which extends the twin's."""
     rig, _ = load_rig_file(twin)
-    mock = settings_of(rig.scene, values)
+    mock = settings_of(scene_of(rig), values)
     data = {
         "extends": os.path.relpath(twin.resolve(), out.parent.resolve()),
         "name": out.stem,

@@ -26,6 +26,7 @@ from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import FORCE
 from sliplab.rigs.mock.levels import choose_level
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, WrenchChunk
 from sliplab.storage.trials.derived import Derived
@@ -192,7 +193,7 @@ def simulate_pilot(
     """
     tracked = changed(with_true_times(rig, with_faults), {"frame_camera": {"level": "tracks"}})
     if not with_events:
-        step_ms = max(rig.scene.scene.step_ms, COARSE_MS)
+        step_ms = max(scene_of(rig).scene.step_ms, COARSE_MS)
         tracked = changed(tracked, {"scene": {"step_ms": step_ms}})
     size = tracked.frame_px(plan)
     assert size is not None

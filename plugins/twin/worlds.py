@@ -29,6 +29,7 @@ from sliplab.protocols import Plan, Trial
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.rig import simulated_rig
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived, make_key
@@ -99,11 +100,11 @@ def other_rig(
         values: by the keys of `PARAMETERS`. skin: settings of it, in addition to those in `values`.
         zero_mm: error of depth zero.
     """
-    settings = settings_of(rig.scene, values)
+    settings = settings_of(scene_of(rig), values)
     scene = settings.setdefault("scene", {})
     scene["level"] = LEVEL
     scene["skin"] = {**scene.get("skin", {}), **skin}
-    scene["contact"] = {"offset_mm": rig.scene.scene.contact.offset_mm + zero_mm}
+    scene["contact"] = {"offset_mm": scene_of(rig).scene.contact.offset_mm + zero_mm}
     return changed(rig, settings)
 
 
@@ -127,7 +128,7 @@ def touch_depth_mm(rig: RigFile) -> float:
     Raises:
         RigError: no touch is detected at all.
     """
-    devices = build_mock(rig.scene, rig.timing)
+    devices = build_mock(scene_of(rig), rig.timing)
     made = simulated_rig(rig, devices)
     try:
         made.connect()
@@ -154,7 +155,7 @@ def guess_of(rig: RigFile, zero_mm: float = ZERO_MM) -> Guess:
     Args:
         zero_mm: largest error of depth zero.
     """
-    skin, friction = rig.scene.scene.skin, rig.scene.scene.friction
+    skin, friction = scene_of(rig).scene.skin, scene_of(rig).scene.friction
     rigid = 1e9
     return Guess(
         height_mm=skin.heights_mm[0],
@@ -188,12 +189,12 @@ class Prior:
     @cached_property
     def parameters(self) -> tuple[SceneParameter, ...]:
         """Parameters that are switched on in the rig file."""
-        return tuple(it for it in PARAMETERS if value_of(self.rig.scene, it) > 0.0)
+        return tuple(it for it in PARAMETERS if value_of(scene_of(self.rig), it) > 0.0)
 
     @property
     def bounds(self) -> tuple[F64, F64]:
         """Least and largest logarithm of each parameter, (p,)."""
-        return prior_bounds(self.rig.scene, self.parameters, self.spread)
+        return prior_bounds(scene_of(self.rig), self.parameters, self.spread)
 
     def values(self, number: int) -> dict[str, float]:
         """Return a world's parameters by key."""
@@ -209,7 +210,7 @@ class Prior:
 
     def _drawn(self, number: int) -> tuple[dict[str, float], np.random.Generator]:
         rng = np.random.default_rng([self.seed, number])
-        return drawn(self.rig.scene, self.parameters, self.spread, rng), rng
+        return drawn(scene_of(self.rig), self.parameters, self.spread, rng), rng
 
     def bank(self, seen: Sequence[SlideStatistics]) -> Bank:
         """Return the first worlds and what they show as a bank."""

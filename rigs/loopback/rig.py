@@ -9,6 +9,7 @@ from functools import partial
 from sliplab.rigs.build import ShouldStop, driven_rig, never
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.client import Loopback
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 
 
@@ -20,7 +21,7 @@ def build_rig(file: RigFile, should_stop: ShouldStop) -> Rig:
     """
     assert file.devices is not None
     with ExitStack() as undo:
-        stage = Loopback(file.scene, file.timing, file.devices, file.streams)
+        stage = Loopback(scene_of(file), file.timing, file.devices, file.streams)
         undo.callback(stage.close)
         rig = loopback_rig(file, stage, should_stop, (stage.close,))
         undo.pop_all()
@@ -46,6 +47,9 @@ def loopback_rig(
     assert reached.devices is not None
     driver, camera = reached.devices.frame_camera_driver, reached.devices.frame_camera
     assert driver.fake is not None  # the rig file was held against it
-    scale, half_ns = file.frame_camera.scale_px_per_mm, file.scene.frame_camera.exposure_us * 500
+    scale, half_ns = (
+        file.frame_camera.scale_px_per_mm,
+        scene_of(file).frame_camera.exposure_us * 500,
+    )
     frames = partial(driver.fake, camera, scale, stage, half_ns)
     return driven_rig(reached, stage, stage, should_stop, stage, frames, on_close)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Dwell, Move, Program
-from sliplab.rigs.mock.settings import MockSettings, skin_of
+from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import Material, slide_onsets
 from sliplab.rigs.scene.randomness import generator
@@ -55,7 +55,7 @@ def choose_level(rig: RigFile, plan: Plan) -> LevelChoice | None:
     """Choose the physics level for a plan on a simulated rig; None on a real one."""
     if not rig.simulated:
         return None
-    stated = rig.scene.scene.level
+    stated = scene_of(rig).scene.level
     if stated != "auto":
         return LevelChoice(int(stated[1]), "set by the rig file (mock.scene.level)")
     slides = slides_of(plan)
@@ -70,7 +70,7 @@ def choose_level(rig: RigFile, plan: Plan) -> LevelChoice | None:
             "onsets under a falling plate have no closed form at the higher levels, so no effect "
             "is left out",
         )
-    return _lowest_level(rig.scene, tuple(slides))
+    return _lowest_level(scene_of(rig), tuple(slides))
 
 
 @lru_cache(maxsize=16)  # `plan` and `collect` ask again for the same rig and protocol
@@ -104,8 +104,8 @@ def with_level(rig: RigFile, plan: Plan) -> RigFile:
 
 def at_level(rig: RigFile, name: str) -> RigFile:
     """Return a simulated rig's file with the scene at the level `name`, such as L2."""
-    scene = rig.scene.scene.model_copy(update={"level": name})
-    return rig.model_copy(update={"mock": rig.scene.model_copy(update={"scene": scene})})
+    scene = scene_of(rig).scene.model_copy(update={"level": name})
+    return rig.model_copy(update={"mock": scene_of(rig).model_copy(update={"scene": scene})})
 
 
 class SlipExpected(TypedDict):
@@ -129,7 +129,7 @@ def slip_expected(rig: RigFile, plan: Plan) -> SlipExpected | None:
     slides = slides_of(plan)
     if not rig.simulated or not slides:
         return None
-    onsets = expected_onsets(rig.scene, slides, HIGHEST)
+    onsets = expected_onsets(scene_of(rig), slides, HIGHEST)
     incipient = onsets[:, 1] - onsets[:, 0]
     return {
         "simulated": True,

@@ -15,6 +15,7 @@ from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.mock.truth import plate_course, watch_plate
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import Sink
@@ -52,7 +53,7 @@ class _MockSimulation:
 
 def build_rig(file: RigFile, should_stop: ShouldStop) -> Rig:
     """Build the simulated devices that a rig file describes, and their rig."""
-    devices = build_mock(file.scene, file.timing, file.streams)
+    devices = build_mock(scene_of(file), file.timing, file.streams)
     return simulated_rig(file, devices, should_stop)
 
 

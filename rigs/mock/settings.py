@@ -511,3 +511,14 @@ def _delay_faults(device: Any, delay: Delay, key: str, name: str) -> Iterator[Ke
             f"{name}.longest_us = {delay.longest_us:g}"
         )
         yield KeyedError(f"{key}.arrival_jitter_us", jitter_us, text)
+
+
+def scene_of(rig: RigFile) -> MockSettings:
+    """Return the simulated scene and devices of a rig file.
+
+    Raises:
+        ValueError: a real rig has none.
+    """
+    if not isinstance(rig.mock, MockSettings):
+        raise ValueError(f"the rig {rig.name} is real: there is no simulated scene")
+    return rig.mock

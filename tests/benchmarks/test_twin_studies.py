@@ -28,6 +28,7 @@ from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
 from sliplab.analysis.evaluation.trials import EvaluatedTrials
 from sliplab.protocols import load_plan
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 
@@ -202,8 +203,8 @@ def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     base, _ = load_rig_file(assumed)
     rig, _ = load_rig_file(twin_studies.hidden_rig(tmp_path, assumed, 2, 1))
     world = replace(prior_of(CLEAN, 2), rig=base).world(1, pilot_slides())
-    assert rig.scene == world.rig.scene
-    assert rig.scene.scene.friction.kinetic != base.scene.scene.friction.kinetic
+    assert scene_of(rig) == scene_of(world.rig)
+    assert scene_of(rig).scene.friction.kinetic != scene_of(base).scene.friction.kinetic
     plans = [load_plan(path) for path in twin_studies.protocols(tmp_path, 3, whole_grid=False)]
     assert [len(plan) for plan in plans] == [576, 108, 144]
     counts = Counter(trial.split for trial in plans[0])

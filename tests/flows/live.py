@@ -16,6 +16,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.rigs.loopback.client import Loopback
 from sliplab.rigs.loopback.rig import loopback_rig
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT, SMALL
@@ -72,7 +73,7 @@ def request_in(folder: Path, data: dict[str, Any], rig: Path) -> RunRequest:
 def stage_of(file: RigFile) -> Iterator[Loopback]:
     """Fakes for a rig file, which outlive the rigs that are built on them."""
     assert file.devices is not None
-    stage = Loopback(file.scene, file.timing, file.devices, file.streams)
+    stage = Loopback(scene_of(file), file.timing, file.devices, file.streams)
     try:
         yield stage
     finally:

@@ -19,6 +19,7 @@ from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, holdout_request, mea
 from sliplab.flows.label import label
 from sliplab.flows.report import report
 from sliplab.plugins.studies.generalise import run as generalise
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
@@ -61,7 +62,7 @@ def test_its_trials_are_others_on_another_skin(store: Store) -> None:
     assert (
         run_request.plan.protocol.collection.seed == SEEDS[0] != item.plan.protocol.collection.seed
     )
-    assert run_request.rig.scene.scene.skin.seed == SEEDS[1]
+    assert scene_of(run_request.rig).scene.skin.seed == SEEDS[1]
     assert {trial.split for trial in run_request.plan} == {"test"}
     assert not {trial.seed for trial in run_request.plan} & {trial.seed for trial in item.plan}
     theirs = Store.open(store.folder / "holdout" / "store").campaign(item.name)

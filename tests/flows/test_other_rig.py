@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.other_rig import other_request
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.storage.trials.store import Store
 from tests.flows.conftest import Ran
 
@@ -21,10 +22,10 @@ def test_only_what_is_asked_for_differs(ran: Ran, tmp_path: Path) -> None:
         3,
     )
     assert run_request.plan.trials == first.plan.trials
-    skin = run_request.rig.scene.scene.skin
-    assert skin.seed == 77 != first.rig.scene.scene.skin.seed
-    own = first.rig.scene.scene
-    again = run_request.rig.scene.scene.model_copy(update={"skin": own.skin})
+    skin = scene_of(run_request.rig).scene.skin
+    assert skin.seed == 77 != scene_of(first.rig).scene.skin.seed
+    own = scene_of(first.rig).scene
+    again = scene_of(run_request.rig).scene.model_copy(update={"skin": own.skin})
     assert skin.model_copy(update={"seed": own.skin.seed}) == own.skin
     assert again == own
-    assert other_request(item, {}, tmp_path / "same").rig.scene == first.rig.scene
+    assert scene_of(other_request(item, {}, tmp_path / "same").rig) == scene_of(first.rig)

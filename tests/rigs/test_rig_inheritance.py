@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.rigs.rig_inheritance import read_rig, rig_path, shipped_rigs
 from tests.conftest import ROOT
@@ -212,4 +213,4 @@ def test_rig_files_to_copy_are_whole(name: str) -> None:
     assert not rig.has_plate
     assert rig.frame_source == "video"
     with pytest.raises(ValueError, match="is real"):
-        _ = rig.scene
+        _ = scene_of(rig)

@@ -34,6 +34,7 @@ from sliplab.plugins.twin.worlds import (
 )
 from sliplab.protocols import Trial
 from sliplab.protocols.shown import plural
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
@@ -75,7 +76,9 @@ class OneSpecimen(Prior):
         """Parameters that may change along a campaign, if they are switched on in the rig file."""
         left_out = MADE if self.with_forces else MADE | STIFFNESSES
         return tuple(
-            it for it in PARAMETERS if it.key not in left_out and value_of(self.rig.scene, it) > 0.0
+            it
+            for it in PARAMETERS
+            if it.key not in left_out and value_of(scene_of(self.rig), it) > 0.0
         )
 
     def world(self, number: int, slides: Slides) -> DrawnWorld:
@@ -142,7 +145,9 @@ def fit_drift(
     """Fit every reference of a campaign; return the prior, and its parameters' drift in order."""
     guess = guess_of(rig)
     first = references.trials[0]
-    prior = OneSpecimen(rig, spread, seed, references.with_forces and rig.scene.force is not None)
+    prior = OneSpecimen(
+        rig, spread, seed, references.with_forces and scene_of(rig).force is not None
+    )
     with_events = references.slides[first.id].camera is not None
     slides = Slides(item.plan, (first,), frozenset({first.id} if with_events else ()))
     saved = Derived.of(store, "drift-worlds", item.name)

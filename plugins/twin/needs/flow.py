@@ -29,6 +29,7 @@ from sliplab.plugins.twin.needs.judging import (
 )
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.worlds import DrawnWorld, everywhere
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
 from sliplab.storage.streams import F64, Json
@@ -120,7 +121,7 @@ def measure_needs(
     own = [marks(trial) for trial in pilot]
     both = own[0].keys() & taken[0][0].keys()
     judged = _Judged(marked([own], both), worlds[:WORLDS], marked(taken[:WORLDS], both))
-    scene = worlds[0].rig.scene
+    scene = scene_of(worlds[0].rig)
     effects = list(effects_of(scene))
     found, against = _measured(judged, effects)
     whole_s, *each_s = judged.seconds([{}, *(effect.without for effect in effects)])

@@ -12,6 +12,7 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
@@ -49,10 +50,10 @@ def test_a_trial_of_127_pins_passes_its_gates_and_is_labelled(tmp_path: Path) ->
 
 def test_the_layout_of_the_rig_file_is_that_of_the_scene() -> None:
     rig, _ = load_rig_file(RIG)
-    assert rig.skin.ring_counts == rig.scene.scene.skin.ring_counts
-    assert float(rig.skin.ring_spacing) == rig.scene.scene.skin.spacing_mm
-    assert float(rig.skin.radius) == rig.scene.scene.skin.radius_mm
-    assert rig.frame_camera.rate_hz == rig.scene.frame_camera.rate_hz
+    assert rig.skin.ring_counts == scene_of(rig).scene.skin.ring_counts
+    assert float(rig.skin.ring_spacing) == scene_of(rig).scene.skin.spacing_mm
+    assert float(rig.skin.radius) == scene_of(rig).scene.skin.radius_mm
+    assert rig.frame_camera.rate_hz == scene_of(rig).frame_camera.rate_hz
 
 
 @pytest.mark.parametrize(

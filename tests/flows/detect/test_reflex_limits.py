@@ -19,7 +19,7 @@ from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.path import SENSOR
 from sliplab.rigs.mock.rig import simulated_rig
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.mock.truth import COURSE, plate_course, watch_plate
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import Chunk, NullSink, PoseChunk
@@ -126,12 +126,12 @@ def one_trial(number: int) -> str:
     rng = np.random.default_rng([20260, number])
     deepest_mm = float(rng.uniform(2.0, 4.0))
     found = fault(rng)
-    scene = FILE.scene.model_dump()
+    scene = scene_of(FILE).model_dump()
     scene["arm"]["start_xyz_mm"] = (399.5, 0.0, 300.0)  # near, for the way takes time
     scene["event_camera"] |= {"width": 64, "height": 64}  # it sees nothing, and is made each time
     scene["faults"] = [] if found is None else [found]
     file = FILE.model_copy(update={"mock": MockSettings.model_validate(scene)})
-    devices = build_mock(file.scene, file.timing)
+    devices = build_mock(scene_of(file), file.timing)
     rig = simulated_rig(file, devices)
     rig.event_camera = rig.frame_camera = None
     rig.poll_s = float(rng.choice([0.005, 0.01, 0.02]))
@@ -207,7 +207,7 @@ def test_no_limit_is_passed_in_ten_thousand_trials_with_faults() -> None:
 def test_the_checks_see_a_limit_that_is_passed() -> None:
     """The same trials with limits that are lower than what was asked for."""
     rng = np.random.default_rng(1)
-    devices = build_mock(FILE.scene, FILE.timing)
+    devices = build_mock(scene_of(FILE), FILE.timing)
     rig = simulated_rig(FILE, devices)
     rig.event_camera = rig.frame_camera = None
     watcher = Drawn(devices, 0.1, SlipDetected)

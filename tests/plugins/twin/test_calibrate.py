@@ -34,6 +34,7 @@ from sliplab.plugins.twin.shown import SameTrials
 from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.protocols import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.derived import Derived
@@ -77,7 +78,7 @@ def answering(
 
     def shown(world: worlds.DrawnWorld) -> SlideStatistics:
         factors = [
-            value_of(world.rig.scene, it) / value_of(wanted.rig.scene, it)
+            value_of(scene_of(world.rig), it) / value_of(scene_of(wanted.rig), it)
             for it in wanted.prior.parameters
         ]
         found = {
@@ -162,7 +163,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     assert rig.twin is not None
     assert rig.twin.checksum == fit.checksum
     assert rig.twin.trials == len(pilot.fitted)
-    papillae = rig.scene.scene.skin.papillae
+    papillae = scene_of(rig).scene.skin.papillae
     assert papillae is not None
     assert len(papillae) == 19
     heights = np.array([it.height_mm for it in papillae])
@@ -173,7 +174,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     friction = next(it for it in fit.parameters if it.key == "scene.friction.kinetic")
     drawn = [one[friction.key] for one in samples]
     assert np.quantile(drawn, [0.025, 0.975]) == pytest.approx([friction.low, friction.high], 0.01)
-    assert rig.scene.scene.friction.kinetic == pytest.approx(friction.value, rel=1e-4)
+    assert scene_of(rig).scene.friction.kinetic == pytest.approx(friction.value, rel=1e-4)
     said = {
         it.name: it.finding
         for it in check(Path("kinematic"), tmp_path / "twin.yaml", tmp_path / "other", ())
@@ -237,7 +238,7 @@ def test_what_is_not_told_keeps_the_rigs_value(
         assert it.value == it.assumed
         assert it.low < it.assumed < it.high
     rig, _ = load_rig_file(tmp_path / "twin.yaml")
-    assert rig.scene.event_camera == wanted.rig.scene.event_camera
+    assert scene_of(rig).event_camera == scene_of(wanted.rig).event_camera
     assert "a force sensor" in (tmp_path / "twin.html").read_text()
 
 
@@ -247,8 +248,8 @@ def test_noise_of_tracking_is_the_pilots_own(store: Store) -> None:
     own, _ = load_rig_file(Path("rehearsal"))
     assert calibrate.with_tracking_noise(own, pilot) == own
     quieter = changed(own, {"frame_camera": {"centroid_noise_px": 0.001}})
-    found = calibrate.with_tracking_noise(quieter, pilot).scene.frame_camera.centroid_noise_px
-    assert found == pytest.approx(own.scene.frame_camera.centroid_noise_px, rel=0.15)
+    found = scene_of(calibrate.with_tracking_noise(quieter, pilot)).frame_camera.centroid_noise_px
+    assert found == pytest.approx(scene_of(own).frame_camera.centroid_noise_px, rel=0.15)
 
 
 def test_a_misfit_ends_with_exit_code_1(

@@ -21,6 +21,7 @@ from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents, SlideMot
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.plugins.twin.rims import CONTRAST, EDGE, HIDDEN, fit_rims
 from sliplab.protocols import load_plan
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import EventChunk
 
@@ -381,7 +382,7 @@ def test_estimates_of_a_simulated_rig(root: Path) -> None:
     plan = load_plan(root / "protocols" / "pilot.yaml")
     trials = [t for t in plan.trials if plan.describe(t)["speed"].startswith("1.6")]
     found = camera_estimates(simulate_pilot(rig, plan, trials, 3))
-    camera = rig.scene.event_camera
+    camera = scene_of(rig).event_camera
     for name, value, within in (
         ("px_per_mm", camera.px_per_mm, 0.01),
         ("marker_radius_mm", camera.radius_mm, 0.02),

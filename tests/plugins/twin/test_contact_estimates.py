@@ -32,6 +32,7 @@ from sliplab.plugins.twin.contact_springs import (
 from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 
 ROOT = Path(__file__).parents[3]
@@ -456,7 +457,7 @@ def test_simulated_slides_show_the_rig_s_own_settings() -> None:
         load_rig_file(ROOT / "rigs/mock_force.yaml"),
     )
     found = estimates(simulate_pilot(rig, plan, plan.trials[:12], 3, with_events=False))
-    scene = rig.scene.scene
+    scene = scene_of(rig).scene
     assert found["relaxation_s"] == pytest.approx(scene.skin.relaxation_s, rel=0.3)
     assert found["hold_relaxation_s"] == pytest.approx(scene.skin.relaxation_s, rel=0.03)
     share = found["relaxation_maxwell"] / (1 + found["relaxation_maxwell"])
@@ -465,5 +466,5 @@ def test_simulated_slides_show_the_rig_s_own_settings() -> None:
     assert found["kinetic"] == pytest.approx(scene.friction.kinetic, rel=0.06)
     assert found["layer_step_mm"] == pytest.approx(1.1, rel=0.08)
     assert found["youngs_modulus_mpa"] == pytest.approx(scene.skin.youngs_modulus_mpa, rel=0.15)
-    assert found["tremor_hz"] == pytest.approx(rig.scene.arm.vibration_hz, rel=0.1)
+    assert found["tremor_hz"] == pytest.approx(scene_of(rig).arm.vibration_hz, rel=0.1)
     assert found["correlation_mm"] == pytest.approx(scene.friction.correlation_mm, rel=0.3)

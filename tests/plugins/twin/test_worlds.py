@@ -14,13 +14,14 @@ from sliplab.plugins.twin.pilots import zero_error_mm
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.rig import simulated_rig
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 
 
 def zero_errors_mm(rig: RigFile, seeds: Iterable[int]) -> list[float]:
     """How far from the surface touching off finds depth zero."""
-    devices = build_mock(rig.scene, rig.timing)
+    devices = build_mock(scene_of(rig), rig.timing)
     made = simulated_rig(rig, devices)
     try:
         made.connect()

@@ -16,7 +16,7 @@ from sliplab.rigs.core.force_watch import POLL_S, ForceWatch
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import WrenchChunk
 
@@ -124,7 +124,7 @@ def force_rig(seed: int) -> Rig:
     """The shipped rig with a force sensor, made anew: skin, cross-talk, drift, taught plane."""
     file, _ = load_rig_file(Path("mock-force"))
     changes = {"frame_camera": {"level": "tracks"}, "seed": seed}
-    scene = MockSettings.model_validate(file.scene.model_dump() | changes)
+    scene = MockSettings.model_validate(scene_of(file).model_dump() | changes)
     rig = build_rig(file.model_copy(update={"mock": scene}))
     rig.connect()
     rig.force_limit_n = LIMIT_N

@@ -22,7 +22,7 @@ from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 from tests.conftest import ROOT
@@ -45,7 +45,7 @@ PROGRAM = Program(
 def make_rig(name: str = "mock-force", limit_n: float | None = LIMIT_N, **scene: Any) -> Rig:
     """A simulated rig with a small event camera, that starts near the plate."""
     file, _ = load_rig_file(Path(name))
-    data = file.scene.model_dump()
+    data = scene_of(file).model_dump()
     data["arm"] |= {"start_xyz_mm": (395.0, 0.0, 300.0)}
     data["event_camera"] |= {"width": 64, "height": 64}
     data["frame_camera"] |= {"level": "tracks"}

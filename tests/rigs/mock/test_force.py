@@ -18,7 +18,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.physics import plate_wrench
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import WrenchChunk
 from sliplab.storage.trials.checksums import DATA
@@ -240,10 +240,10 @@ def test_its_delay_is_held_against_the_timing() -> None:
 def test_the_rig_that_ships_has_it() -> None:
     file, _ = load_rig_file(Path("mock-force"))
     assert file.timing.force.grade == "host time"
-    assert file.scene.force is not None
+    assert scene_of(file).force is not None
     plain, _ = load_rig_file(Path("mock"))
     assert plain.timing.force is None
-    assert plain.scene.force is None
+    assert scene_of(plain).force is None
 
 
 # -- one time line with the events ---------------------------------------------------------
@@ -261,7 +261,7 @@ def torn_rig(seed: int, delay: Delay | None = None) -> Rig:
     file, _ = load_rig_file(Path("mock-force"))
     fault = {"kind": "papilla_torn", "papilla": 0, "at_s": TORN_S}
     changes = {"faults": [fault], "frame_camera": {"level": "tracks"}, "seed": seed}
-    scene = MockSettings.model_validate(file.scene.model_dump() | changes)
+    scene = MockSettings.model_validate(scene_of(file).model_dump() | changes)
     timing = file.timing
     if delay is not None:
         force = timing.force.model_copy(update={"delay": delay})

@@ -26,6 +26,7 @@ from sliplab.plugins.studies.generalise.results import Generalisation, markdown
 from sliplab.plugins.studies.generalise.run import measure_generalisation, skin_task
 from sliplab.plugins.studies.generalise.section import RESULT
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.storage.files import json_text, read_json
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
@@ -78,7 +79,7 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     monkeypatch.setattr(
         other_rig,
         "collect",
-        lambda run_request: seen.append(run_request.rig.scene.scene.skin.seed),
+        lambda run_request: seen.append(scene_of(run_request.rig).scene.skin.seed),
     )
     model = choose_model(wanted_models(store, collected(store)))
     with pytest.raises(StoreError, match="holds no campaign yet"):

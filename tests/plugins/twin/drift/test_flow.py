@@ -28,6 +28,7 @@ from sliplab.plugins.twin.parameters import value_of
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.protocols import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import IMPORTED, Store, StoreError
@@ -84,11 +85,11 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
         )
 
     def world(self: worlds.DrawnWorld) -> SlideStatistics:
-        values = {it.key: value_of(self.rig.scene, it) for it in prior.parameters}
+        values = {it.key: value_of(scene_of(self.rig), it) for it in prior.parameters}
         return of(values, np.random.default_rng(self.seed))
 
     def reference(slides: Sequence[PilotTrial], *_: Any) -> SlideStatistics:
-        values = {it.key: value_of(rig.scene, it) for it in prior.parameters}
+        values = {it.key: value_of(scene_of(rig), it) for it in prior.parameters}
         values[FRICTION] *= friction[slides[0].trial]
         return of(values, np.random.default_rng(int(1e6 * friction[slides[0].trial])))
 

@@ -24,6 +24,7 @@ from sliplab.plugins.twin.gap.study import STUDY
 from sliplab.plugins.twin.posterior import ParameterPosterior, Posterior
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols import InputError
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
@@ -143,9 +144,9 @@ def test_trials_are_taken_on_the_rig_that_is_named(found: TwinGap, wanted: gap.G
         rigs = [
             load_rig_file(item.campaign.folder / "rig.yaml", stored=True)[0] for item in campaigns
         ]
-        frictions[it.trained_on] = [rig.scene.scene.friction for rig in rigs]
+        frictions[it.trained_on] = [scene_of(rig).scene.friction for rig in rigs]
         touched[it.trained_on] = [rig.calibration.touch_depth for rig in rigs]
-    assumed = load_rig_file(Path("rehearsal"))[0].scene.scene.friction
+    assumed = scene_of(load_rig_file(Path("rehearsal"))[0]).scene.friction
     assert frictions["assumed"] == [assumed]
     assert [it.kinetic for it in frictions["twin"]] == [0.75]
     assert sorted(it.kinetic for it in frictions["drawn"]) == pytest.approx([0.7, 0.8])

@@ -17,6 +17,7 @@ from sliplab.plugins.twin.needs import flow as needs
 from sliplab.plugins.twin.needs.judging import Marks, Need, marks
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
+from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.conftest import tiny, write
 
@@ -47,8 +48,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two effects, worlds in this process, and scenes that take the stated times."""
 
     def seconds(rig: Any, *_: Any) -> float:
-        trembles = rig.scene.arm.vibration_um > 0.0
-        return 0.1 + 0.1 * trembles + 0.05 * (rig.scene.scene.friction.path_variation > 0.0)
+        trembles = scene_of(rig).arm.vibration_um > 0.0
+        return 0.1 + 0.1 * trembles + 0.05 * (scene_of(rig).scene.friction.path_variation > 0.0)
 
     two = tuple(it for it in EFFECTS if it.key in {"vibration", "path"})
     monkeypatch.setattr("sliplab.plugins.twin.effects.EFFECTS", two)
@@ -93,9 +94,9 @@ def test_an_effect_that_the_pilot_lacks_is_left_out_of_the_cheapest_scene(
     assert said_of_it in path.read_text()
     rig, _ = load_rig_file(path)
     assert rig.name == "twin-cheapest"
-    assert rig.scene.arm.vibration_um == 0.0
-    assert rig.scene.scene.friction.path_variation > 0.0
-    assert rig.scene.scene.level == "L3"
+    assert scene_of(rig).arm.vibration_um == 0.0
+    assert scene_of(rig).scene.friction.path_variation > 0.0
+    assert scene_of(rig).scene.level == "L3"
 
 
 def test_what_is_asked_for_together_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
