@@ -100,6 +100,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(group))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any, ids: list[str]) -> None:
+    """Stop where pytest-xdist has not put the groups behind the tests' names, as it reads them."""
+    grouped = any(name.rfind("@") > name.rfind("]") for name in ids)
+    if node.config.option.dist == "loadgroup" and ids and not grouped:
+        pytest.exit("pytest-xdist cannot group tests under this pytest: install pytest<9.2", 3)
+
+
 def pytest_collection_finish() -> None:
     """Spare the collector all that was imported: what tests leave behind goes at once then.
 

@@ -65,7 +65,7 @@ def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) ->
     found = only(taken[camera])
     record, other = found.record, OTHER[camera]
     counts = record.counts.model_dump()
-    assert counts[camera] > 500
+    assert counts[camera] > 300
     assert counts[other] == 0
     assert record.quality.passed
     assert sorted(record.clocks.devices()) == sorted([camera, "arm"])
