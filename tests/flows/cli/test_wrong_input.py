@@ -150,7 +150,7 @@ def test_levels_to_be_enabled(given: str, message: str) -> None:
         (("check", "pilot", "--rig", "mock", "--store", "s3://b/x"), "s3://b/x: is a URL"),
         (
             ("import", "file:///x", "--store", "x", "--name", "x"),
-            "file:/x: is a URL",
+            "file:///x: is a URL",
         ),
         (("evaluate", "x", "--margin", "nan"), "--margin = nan: must be a number"),
         (("pause", "x", "--wait", "-1"), "--wait = -1: must be greater than or equal to 0"),

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from sliplab.storage.files import read_json
+from sliplab.storage.remote.objects import LAYOUT_FILE
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.flows.server.serving import serving, until
@@ -63,3 +65,26 @@ def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(tmp_path: Path) -> N
         ("COMPLETED", "flow"),
         ("CRASHED", "service"),
     ]
+
+
+def test_a_push_that_hangs_delays_no_collection(tmp_path: Path) -> None:
+    """The remote place answers nothing: its marker is a pipe that nobody writes to."""
+    protocol = write(tmp_path / "protocol.yaml", tiny())
+    store, log, remote = tmp_path / "store", tmp_path / "log", tmp_path / "remote"
+    remote.mkdir()
+    os.mkfifo(remote / LAYOUT_FILE)
+    nights = tmp_path / "schedules.yaml"
+    nights.write_text(
+        "timezone: UTC\nschedules:\n"
+        f"  - {{name: copy, flow: push, url: 'file://{remote}', cron: '0 0 1 1 *'}}\n"
+    )
+    Store.create(store)
+    with serving(store, RIG, "beside", None, log, nights) as page:
+        pushing = page.run("push")["id"]
+        until("the push", lambda: page.state(pushing)["type"] == "RUNNING")
+        taking = page.run("collect", protocol=str(protocol))["id"]
+        said = page.ended(taking)
+        assert said["type"] == "COMPLETED", log.read_text()
+        assert page.state(pushing)["type"] == "RUNNING"
+        page.cancel(pushing)
+        assert page.ended(pushing)["type"] == "CANCELLED"
