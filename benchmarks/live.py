@@ -36,7 +36,7 @@ def measure(seconds: float = HOUR_S) -> Figures:
     parts = [slice(int(a), int(b)) for a, b in pairwise(edges) if b > a]
     engine = SpikeEngine(gridded(Windows(), SEED), Windows().cells)
     network = NetworkDetector(lambda x: engine.counts(x, 1), Windows(), Detection())
-    network.warm_up()
+    network.warm_up(640, 480)
     live = LiveDetector(network)
     taken = array("d")  # a list would grow by more than the detector
     memory: list[float] = []

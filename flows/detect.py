@@ -17,7 +17,6 @@ from typing import NotRequired, TypeAlias, TypedDict
 
 from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.live import LiveDetector, TimedDecision
-from sliplab.analysis.detectors.network_detector import NetworkDetector
 from sliplab.analysis.networks import training
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
@@ -143,9 +142,9 @@ def detect(
         done.enter_context(stopping.signals())
         rig = build(request.rig, stopping.requested)
         done.callback(rig.close)
-        if isinstance(detector, NetworkDetector):
-            detector.warm_up()
-        live = LiveDetector(detector, width=rig.events.width, height=rig.events.height)
+        size = rig.events.width, rig.events.height
+        detector.warm_up(*size)
+        live = LiveDetector(detector, width=size[0], height=size[1])
         view = DetectView(_title(request), request.source.most) if show else None
         if view is not None:
             done.enter_context(view)

@@ -121,6 +121,8 @@ def detectors_of(
 def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
     """Return the networks with their rules, and the tuned detectors, unless none is wanted."""
     if not any((place / "models").glob("*.pt")):
+        if names and all(map(is_known, names)):
+            return {}
         right = "has no models/*.pt: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
     store = Store(place)

@@ -18,6 +18,8 @@ from sliplab.analysis.detectors.detector import (
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.storage.streams import EventChunk
 
+WARM_UP_US = 1_000_000
+
 
 class AtLevel(StreamDetector):
     """A detector with its level. Evidence above it is gross slip by the detector's own class alone.
@@ -36,6 +38,11 @@ class AtLevel(StreamDetector):
         """See `Detector`. Raises DetectorError."""
         self._size, self._number = (width, height), 0
         self.resume(0)
+
+    def warm_up(self, width: int, height: int) -> None:
+        """Push a second without events. Raises DetectorError."""
+        self.begin(width, height)
+        self.push(EventChunk.empty(), WARM_UP_US)
 
     def resume(self, at_us: int) -> None:
         """Begin a new scene. Raises DetectorError."""

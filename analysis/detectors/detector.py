@@ -191,6 +191,10 @@ class StreamDetector(Detector):
         """Time before which events no longer count; `NOTHING_US` before anything is settled."""
 
     @abstractmethod
+    def warm_up(self, width: int, height: int) -> None:
+        """Load and compile everything before `begin`, so that the first answer need not wait."""
+
+    @abstractmethod
     def resume(self, at_us: int) -> None:
         """Begin again at a time, before which the stream was interrupted."""
 

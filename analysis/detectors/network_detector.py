@@ -168,8 +168,8 @@ class NetworkDetector(StreamDetector):
         self._next, self._settled_us = 0, NOTHING_US
         self._bin(EventChunk.empty(), 0)
 
-    def warm_up(self) -> None:
-        """Load and compile everything in advance, so that the first window need not wait."""
+    def warm_up(self, width: int, height: int) -> None:
+        """See `StreamDetector`."""
         self._counts(self._empty())
 
     def resume(self, at_us: int) -> None:

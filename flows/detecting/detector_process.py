@@ -69,14 +69,14 @@ class DetectorProcess(Detector):
 
     Args:
         name, level, store: as `flows.detecting.sources.NamedSource`.
-        answer_s: timeout of an answer.
+        answer_s: timeout of an answer after the first one, for which kernels may be compiled.
 
     Raises:
         DetectorError: it does not start.
     """
 
     def __init__(self, name: str, level: float | None, store: Path | None, answer_s: float) -> None:
-        self._answer_s = answer_s
+        self._answer_s, self._warm = answer_s, False
         arguments = name, level, None if store is None else str(store)
         with _as_detector_error():
             self._process = LibraryProcess(
@@ -91,9 +91,11 @@ class DetectorProcess(Detector):
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`. Raises DetectorError."""
+        within_s = self._answer_s if self._warm else START_S
         with _as_detector_error():
-            found: Evidence = self._process.call("push", events, until_us, within_s=self._answer_s)
-            return found
+            found: Evidence = self._process.call("push", events, until_us, within_s=within_s)
+        self._warm = True
+        return found
 
     def close(self) -> None:
         """End the process."""

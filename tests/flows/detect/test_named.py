@@ -47,13 +47,13 @@ class Recording(Detector):
 
 
 class Failing(Detector):
-    """Fails when a second of a scene is over."""
+    """Fails after a second of a scene."""
 
     def begin(self, width: int, height: int) -> None:
         pass
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
-        if until_us < 1_000_000:
+        if until_us <= 1_000_000:
             return Evidence.of([], [])
         return Evidence.of([until_us], [np.nan])
 
