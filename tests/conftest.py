@@ -103,9 +103,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_node_collection_finished(node: Any, ids: list[str]) -> None:
     """Stop where pytest-xdist has not put the groups behind the tests' names, as it reads them."""
-    grouped = any(name.rfind("@") > name.rfind("]") for name in ids)
+    grouped = any(_without_group(name) != name for name in ids)
     if node.config.option.dist == "loadgroup" and ids and not grouped:
         pytest.exit("pytest-xdist cannot group tests under this pytest: install pytest<9.2", 3)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Keep what failed by its name without the group, as `--last-failed` looks for it."""
+    if hasattr(report, "node"):  # from a worker
+        report.nodeid = _without_group(report.nodeid)
+
+
+def _without_group(name: str) -> str:
+    at = name.rfind("@")
+    return name[:at] if at > name.rfind("]") else name  # one in brackets is a parameter's
 
 
 def pytest_collection_finish() -> None:
