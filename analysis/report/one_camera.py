@@ -162,7 +162,14 @@ def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
 
 def one_camera_cover(summary: OneCameraSummary) -> Cover:
     """Return the first screen."""
-    found = []
+    notices = quality_notices(summary.quality)
+    return Cover("report.html", slip_answer(summary), notices, headline(summary))
+
+
+def headline(summary: OneCameraSummary) -> list[Number]:
+    """Return the numbers below the first screen."""
+    quality = summary.quality
+    found = [Number("trials committed", str(quality.committed), f"of {quality.planned} planned")]
     if (labels := summary.labels) is not None:
         both = labels.rules_ms.apart
         found.append(
@@ -185,7 +192,7 @@ def one_camera_cover(summary: OneCameraSummary) -> Cover:
         )
         value = number(summary.clocks_us.get(device), 1, "µs")
     found.append(Number("clock uncertainty", value, f"worst trial, {device}"))
-    return Cover("report.html", slip_answer(summary), quality_notices(summary.quality), found)
+    return found
 
 
 @dataclass(frozen=True)

@@ -81,16 +81,27 @@ class ProvenanceSection(Content):
 
 def report_cover(summary: Summary) -> Cover:
     """Return the first screen."""
-    notices = quality_notices(summary.quality)
-    if any(rule.choose == "test" for rule in summary.detection.values()):
-        notices.append("smoothing and margin were chosen on test trials, which flatters them")
+    notices = [*quality_notices(summary.quality), *_choice(summary)]
+    return Cover("report.html", slip_answer(summary), notices, headline(summary))
+
+
+def headline(summary: Summary) -> list[Number]:
+    """Return the numbers below the first screen."""
+    quality = summary.quality
     uncertain, device = clocks.worst_clock(summary.sync)
     note = clocks.short_note(summary.sync, summary.labels)
-    headline = [
-        *slip_tiles(summary),
+    return [
+        Number("trials committed", str(quality.committed), f"of {quality.planned} planned"),
+        *slip_tiles(summary, "".join(f"; {text}" for text in _choice(summary))),
         Number("clock uncertainty", uncertain, f"worst trial, {device}; {note}"),
     ]
-    return Cover("report.html", slip_answer(summary), notices, headline)
+
+
+def _choice(summary: Summary) -> list[str]:
+    """Return a warning where the rule was chosen on the trials that it is judged by."""
+    if any(rule.choose == "test" for rule in summary.detection.values()):
+        return ["smoothing and margin chosen on test trials"]
+    return []
 
 
 def make_sections(
