@@ -17,12 +17,11 @@ from sliplab import protocols
 from sliplab.flows.running import console, run_records
 from sliplab.flows.running.embedded_server import WebFront
 from sliplab.flows.server.helpers import keep_running
+from sliplab.flows.server.links import ROLES, Links
 from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
 from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
 from sliplab.flows.server.service import Service, deployment_name
-from sliplab.flows.web.access import ROLES
-from sliplab.flows.web.links import Links
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import Store
