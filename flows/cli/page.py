@@ -43,15 +43,16 @@ def page(
     opened = Store.open(store)
     public = origin(public_url)
     configure_prefect(opened.folder)  # before anything imports Prefect
+    from sliplab.flows.server.links import Links
     from sliplab.flows.server.service import ENVIRONMENT, service
     from sliplab.flows.web import serving
-    from sliplab.flows.web.links import Links
+    from sliplab.flows.web.access import Access
     from sliplab.flows.web.web import Web
 
     links = Links(Path(os.environ["PREFECT_HOME"]))
     web = Web(
         opened,
-        links.access(),
+        Access(links.tokens()),
         schedules=schedules,
         service=service() if ENVIRONMENT in os.environ else None,
         prefect="/v2/" if socket else None,

@@ -33,11 +33,14 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sliplab.flows.running.process import collect_garbage_seldom, die_with
 from sliplab.flows.running.same_origin import SameOrigin
 from sliplab.storage.process import Child
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -257,10 +260,9 @@ def _serve(handle: int, parent: int, home: Path) -> None:
 
     prepare_database(home)
     with socket.socket(fileno=handle) as listener:
-        app = create_app()
-        if socket_path := os.environ.get(WEB):
-            app = Forward(app, Path(socket_path))
-        app = SameOrigin(app, listener.getsockname()[1], os.environ.get(PUBLIC, ""))
+        prefect, web = create_app(), os.environ.get(WEB)
+        inside: ASGIApp = Forward(prefect, Path(web)) if web else prefect
+        app = SameOrigin(inside, listener.getsockname()[1], os.environ.get(PUBLIC, ""))
         uvicorn.Server(uvicorn.Config(app, log_level="error")).run(sockets=[listener])
 
 

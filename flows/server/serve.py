@@ -17,12 +17,11 @@ from sliplab import protocols
 from sliplab.flows.running import console, run_records
 from sliplab.flows.running.embedded_server import WebFront
 from sliplab.flows.server.helpers import keep_running
+from sliplab.flows.server.links import ROLES, Links
 from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
 from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
 from sliplab.flows.server.service import Service, deployment_name
-from sliplab.flows.web.access import ROLES
-from sliplab.flows.web.links import Links
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import Store
@@ -85,15 +84,15 @@ def serve(
         for item in run_records.close_killed_runs(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
         if page is None:
-            place = ("--port", str(_beside(url, port)), "--public-url", public)
+            place = ["--port", str(_beside(url, port)), "--public-url", public]
         else:
             links = Links(Path(os.environ["PREFECT_HOME"]))
             links.write(public or run_records.server_name(url))
-            place = ("--socket", str(front.socket))
-        programs = [("page", str(store.folder), *place)]
-        programs[0] += ("--schedules", str(shown)) if shown is not None else ()
+            place = ["--socket", str(front.socket)]
+        place += [] if shown is None else ["--schedules", str(shown)]
+        programs = [["page", str(store.folder), *place]]
         if alerts is not None:
-            programs.append(("alerts", str(store.folder), str(alerts)))
+            programs.append(["alerts", str(store.folder), str(alerts)])
         asyncio.run(_serve(here, schedules, url, page, poll_s, programs))
 
 
@@ -103,7 +102,7 @@ async def _serve(
     url: str,
     page: PageServer | None,
     poll_s: float,
-    programs: Sequence[tuple[str, ...]],
+    programs: Sequence[Sequence[str]],
 ) -> None:
     from prefect.settings import (
         PREFECT_API_REQUEST_TIMEOUT,

@@ -15,16 +15,16 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, quote, unquote
 
 from starlette.responses import PlainTextResponse
 
+from sliplab.flows.server.links import ROLES, Role
+
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-Role = Literal["operator", "reader"]
-ROLES: tuple[Role, ...] = ("operator", "reader")
 COOKIE, NAME_COOKIE = "sliplab", "sliplab-name"
 """The first is followed by the server's port: browsers send cookies to all ports of a host."""
 CSRF_FIELD, CSRF_HEADER = "csrf", "x-csrf-token"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from starlette.testclient import TestClient
 
+from sliplab.flows.server.links import Role
 from sliplab.flows.ui.review import TrialList
-from sliplab.flows.web.access import Access, Role, Viewer
+from sliplab.flows.web.access import Access, Viewer
 from sliplab.flows.web.app import application
 from sliplab.flows.web.web import Web
 from sliplab.storage.trials.store import Store

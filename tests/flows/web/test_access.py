@@ -8,7 +8,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from sliplab.flows.log import log_entries
-from sliplab.flows.web.access import Access, Role
+from sliplab.flows.server.links import Role
+from sliplab.flows.web.access import Access
 from sliplab.flows.web.app import application
 from sliplab.flows.web.web import Web
 from sliplab.storage.trials.store import Store

@@ -5,10 +5,12 @@ from __future__ import annotations
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from sliplab.flows.running.private_file import stored_secret, write_private
-from sliplab.flows.web.access import ROLES, Access, Role
 
+Role = Literal["operator", "reader"]
+ROLES: tuple[Role, ...] = ("operator", "reader")
 _TOKEN = r"[\w-]{40,80}"
 
 
@@ -22,13 +24,13 @@ class Links:
 
     home: Path
 
-    def access(self) -> Access:
+    def tokens(self) -> dict[Role, str]:
         """Return the tokens; they are made if missing.
 
         Raises:
             InputError: they cannot be stored where only this user can read them.
         """
-        return Access({role: self._token(role) for role in ROLES})
+        return {role: self._token(role) for role in ROLES}
 
     def write(self, address: str) -> dict[Role, str]:
         """Write the links of a page at an address, and return them.
@@ -36,7 +38,7 @@ class Links:
         Raises:
             InputError: they cannot be stored where only this user can read them.
         """
-        links = {role: f"{address}/enter?token={self._token(role)}" for role in ROLES}
+        links = {role: f"{address}/enter?token={token}" for role, token in self.tokens().items()}
         for role, link in links.items():
             write_private(self.file(role), link)
         return links
