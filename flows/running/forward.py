@@ -47,7 +47,13 @@ class Forward:
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Answer a request; with the server's life end the connections to the other program."""
+        if scope["type"] == "lifespan":
+            try:
+                await self._prefect(scope, receive, send)
+            finally:
+                await self._client.aclose()
+            return
         path = f"{scope.get('path', '')}/"
         if scope["type"] != "http" or path.startswith(tuple(f"{part}/" for part in PREFECT)):
             await self._prefect(scope, receive, send)

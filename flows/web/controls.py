@@ -26,6 +26,8 @@ MOST_CHARACTERS = 1000
 """Of a reason."""
 ANSWER_S = 20.0
 """Longest wait for Prefect's answer, s."""
+RETRIES = 4
+"""Of a request to Prefect, whose database may be written to meanwhile (503)."""
 
 
 class Controls:
@@ -157,7 +159,7 @@ def _create_run(here: Service, wanted: Mapping[str, Any]) -> None:
     name = f"collect/{deployment_name('collect', here.name)}"
     try:
         with (
-            temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: 0}),
+            temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: RETRIES}),
             get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
         ):
             deployment = client.read_deployment_by_name(name)
