@@ -63,10 +63,16 @@ def routes(web: Web) -> list[BaseRoute]:
             trials = await asyncio.to_thread(reviews.trials)
         except (StoreError, InputError) as error:
             return web.render(request, "problem.html", 404, title="Review", problem=str(error))
-        about = {"campaigns": list(trials.items), "ranked": trials.ranked, "states": STATES}
-        who = viewer(request).name or web.who
         return web.render(
-            request, "review.html", title="Review", verdicts=VERDICTS, keys=KEYS, who=who, **about
+            request,
+            "review.html",
+            title="Review",
+            campaigns=list(trials.items),
+            ranked=trials.ranked,
+            states=STATES,
+            verdicts=VERDICTS,
+            keys=KEYS,
+            who=viewer(request).name or web.who,
         )
 
     async def rows(request: Request) -> Response:

@@ -151,7 +151,7 @@ def frame_html(shown: ShownTrial, index: int) -> str:
         raise IndexError(f"{shown.recording.trial_id}: has no frame {index}")
     picture = shown.picture(index)
     places = shown.places(index)
-    seen = np.isfinite(places).all(axis=1)
+    seen = np.asarray(np.isfinite(places).all(axis=1))
     width, height = _size(shown) if picture is None else picture.shape[::-1]
     image = "" if picture is None else f"<image href='{_png(picture)}'/>"
     text = escape(_caption(shown, index, np.flatnonzero(~seen)))

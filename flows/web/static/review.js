@@ -110,6 +110,8 @@ function show(found) {
   parts.innerHTML = found.html;
   for (const part of [...parts.content.children]) find(`.${part.className}`).replaceWith(part);
   position();
+  // the tool's speed says nothing about a label, and the decision should be on the same screen
+  found.curves.panels = found.curves.panels.filter((panel) => panel.unit !== "mm/s");
   panels.show(found.curves, kept);
   lines();
   if (form) {
