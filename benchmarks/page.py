@@ -3,7 +3,8 @@
 A simulated rig takes trials with and without viewers in turn. `watched_over_alone` is the processor
 time that the collecting program spends on a planned second with viewers over that without (its wall
 time says more about what else the machine does), `page_core_percent` the processor time of the
-page's program while it is watched, as a share of one core, `page_memory_mb` what it holds at the
+page's program while it is watched, as a share of one core, `feed_core_percent` that of the thread
+which makes the pictures in the collecting program, `page_memory_mb` what it holds at the
 end, and `pictures_per_s` how often each viewer gets new pictures.
 """
 
@@ -23,6 +24,7 @@ from urllib.parse import urlsplit
 
 from benchmarks.measure import RUNS, Figures, spread
 from benchmarks.trials import ROOT, SimulatedSession, open_session
+from sliplab.flows.collecting.live_feed import THREAD as FEED
 from sliplab.storage.process import Child
 
 VIEWERS = 3
@@ -103,9 +105,10 @@ def _page(store: Path) -> Iterator[tuple[Child, str]]:
 
 def measure(runs: int = RUNS, seconds: float = 20.0) -> Figures:
     """Take trials for so long with viewers, and for so long without, `runs` times."""
-    ratios, shares, rates = [], [], []
+    ratios, shares, feeds, rates = [], [], [], []
     with ExitStack() as stack:
         work = stack.enter_context(open_session("rehearsal", 800))
+        (feed,) = (f"self/task/{t.native_id}" for t in threading.enumerate() if t.name == FEED)
         child, link = stack.enter_context(_page(work.collector.campaign.folder.parents[1]))
         work.take(2)  # compiled
         for _ in range(runs):
@@ -114,15 +117,18 @@ def measure(runs: int = RUNS, seconds: float = 20.0) -> Figures:
                 pictures()  # they are there
                 # the page has read the store, and the collection has seen that it is watched
                 _pace(work, min(seconds, 5.0))
-                before, seen = _processor_s(child.pid), pictures()
+                before, seen = _processor_s(str(child.pid)), pictures()
+                fed = _processor_s(feed)
                 watched, took = _pace(work, seconds)
-                shares.append(100 * (_processor_s(child.pid) - before) / took)
+                shares.append(100 * (_processor_s(str(child.pid)) - before) / took)
+                feeds.append(100 * (_processor_s(feed) - fed) / took)
                 rates.append((pictures() - seen) / took)
             ratios.append(watched / alone)
         memory = _memory_mb(child.pid)
     return {
         **spread("watched_over_alone", ratios),
         **spread("page_core_percent", shares),
+        **spread("feed_core_percent", feeds),
         **spread("pictures_per_s", rates),
         "page_memory_mb": memory,
     }
@@ -140,8 +146,8 @@ def _pace(work: SimulatedSession, seconds: float) -> tuple[float, float]:
     return (time.process_time() - used) / planned, took
 
 
-def _processor_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+def _processor_s(process: str) -> float:
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICK
 
 

@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 else:
     cv2 = Later("cv2")
 
+THREAD = "live feed"
+"""Name of the thread that publishes."""
 FOLDER = ".live"
 WATCHED, STATE, PICTURES = "watched", "state.json", "pictures.json"
 PERIOD_S = 0.5
@@ -191,7 +193,7 @@ class LiveFeed:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Publish while the block runs."""
-        thread = threading.Thread(target=self._publish, name="live feed", daemon=True)
+        thread = threading.Thread(target=self._publish, name=THREAD, daemon=True)
         with console.lines_to(self._lines.append):
             thread.start()
             try:

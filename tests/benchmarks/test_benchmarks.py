@@ -46,7 +46,8 @@ PROMISED = {
     "labels": {"x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime"}
     | {"aruco_x_realtime"},
     "exchange_memory": {"dsec_import_peak_mb", "dsec_export_peak_mb"},
-    "page": {"page_core_percent", "page_memory_mb", "watched_over_alone", "pictures_per_s"},
+    "page": {"page_core_percent", "page_memory_mb", "watched_over_alone", "pictures_per_s"}
+    | {"feed_core_percent"},
     "fewer": {f"{way}_worst_claim_wrong_percent" for way in ("shuffled", "adaptive")}
     | {f"{way}_true_trials_percent" for way in ("shuffled", "adaptive")}
     | {"adaptive_over_shuffled"},

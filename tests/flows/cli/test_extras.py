@@ -126,7 +126,7 @@ LACKING: dict[str, dict[str, str]] = {
     "prefect": {
         "label STORE": "prefect",
         "sync STORE": "prefect",
-        "review STORE": "starlette",
+        "review STORE": "uvicorn",
         "collect pilot --rig rehearsal --store OUT/new --trials 1": "prefect",
     },
     "report": {

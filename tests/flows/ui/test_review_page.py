@@ -1,4 +1,4 @@
-"""The review page in a real browser: what a person does is kept, and nobody else gets in."""
+"""Review and trials in a real browser: what a person does is kept, and nobody else gets in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 from urllib.error import HTTPError
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, urljoin, urlsplit
 from urllib.request import Request, urlopen
 
 import pytest
@@ -280,6 +280,29 @@ def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: 
     kept = review.history(served.made.store, NAME, trial)
     assert (kept[0].verdict, kept[0].who) == ("reject", "bert")
     assert all(item.number == place + 1 for place, item in enumerate(kept))
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_a_trial_has_its_curves_and_frames_on_any_screen(
+    served: Served, tab: Tab, width: int
+) -> None:
+    page, trial = tab.page, served.made.ids[0]
+    page.set_viewport_size({"width": width, "height": 900})
+    sideways = "document.documentElement.scrollWidth > innerWidth"
+    assert not page.evaluate(sideways)
+    tab.heading().scroll_into_view_if_needed()
+    page.goto(urljoin(page.url, "/trials"))
+    assert not page.evaluate(sideways)
+    page.get_by_label("Id holds").fill(trial)
+    page.keyboard.press("Enter")
+    page.get_by_role("link", name=trial, exact=True).click()
+    expect(page.locator(".plot path.curve")).to_have_count(7 + 1 + 1)  # markers, events, speed
+    expect(page.get_by_text(re.compile(r"^frame \d+ at"))).to_be_visible()
+    page.get_by_role("slider", name="Frame").fill("12")
+    expect(page.get_by_text("frame 12 at 0.125 s")).to_be_visible()
+    page.get_by_role("button", name="Check every byte").click()
+    expect(page.get_by_text("all intact")).to_be_visible()
+    assert not page.evaluate(sideways)
 
 
 def test_nobody_else_gets_in(served: Served) -> None:
