@@ -126,7 +126,11 @@ def serve_detector(fd: int, name: str, level: float | None, store: str | None) -
             os._exit(1)
         pipe.send((True, None))
         detector = made.detector
-        calls = {"level": lambda: made.level, "begin": detector.begin, "push": detector.push}
+        calls: dict[str, Callable[..., Any]] = {
+            "level": lambda: made.level,
+            "begin": detector.begin,
+            "push": detector.push,
+        }
         _answer(pipe, lambda what, arguments: calls[what](*arguments))
         made.close()
     os._exit(0)

@@ -107,12 +107,9 @@ def make_detect_request(
     file, _ = load_rig_file(rig)
     given = (("margin", margin), ("smoothing", smoothing))
     change = {name: value for name, value in given if value is not None}
+    source: Callable[[AnalysisSettings | None], Source]
     if isinstance(detector, NamedSource):
-        named = detector
-
-        def source(stated: AnalysisSettings | None) -> Source:
-            return named
-
+        source = partial(_named, detector)
     else:
         assert model is not None
         source = _network(model, stride_ms, detector, change)
@@ -150,6 +147,11 @@ def make_detect_request(
 def _read_often(file: RigFile, poll_s: float) -> RigFile:
     """Return a rig that reads its streams at least this often."""
     return file.model_copy(update={"poll": min(file.poll, Decimal(str(poll_s)))})
+
+
+def _named(source: NamedSource, stated: AnalysisSettings | None) -> Source:
+    """Return a detector by its name; a protocol's settings do not change it."""
+    return source
 
 
 def _network(
