@@ -12,7 +12,7 @@ from sliplab.analysis.labels.reviewed import state_of
 from sliplab.flows.ui.trial_data import ShownTrial, tool_speed
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import F64, SCALAR, WRENCH, Json
-from sliplab.storage.trials.review import Decision, ReviewedOnsets
+from sliplab.storage.trials.review import Decision
 
 MOST_POINTS = 4000
 """Points of a curve; a longer one is drawn by the least and the greatest value of each part."""
@@ -27,15 +27,14 @@ _RING = 0.2
 def curves_json(shown: ShownTrial, decision: Decision | None, key: str) -> Json:
     """Return what a page draws of a trial over its time line; times as s, exact ones as text in ns.
 
+    A simulation's truth is left out: who reviews a label must not know it.
+
     Args:
         decision: the last one about its label, if any; key: of the label by the present settings.
     """
     onsets = {"label": shown.onsets, "suggested": shown.suggested}
     if decision is not None and state_of(decision, key) == "adjusted":
         onsets["review"] = decision.new
-    truth = shown.recording.simulation_truth()
-    if truth is not None:
-        onsets["truth"] = ReviewedOnsets(truth.get("incipient_ns"), truth.get("gross_ns"))
     return {
         "span": shown.span_s,
         "motion": shown.motion_s[0],

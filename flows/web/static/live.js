@@ -41,7 +41,7 @@ on("curves", (text) => {
   const known = [];
   for (const [from, both] of Object.entries(trial.onsets))
     for (const kind of KINDS)
-      if (both[`${kind}_ns`] !== null) known.push(`${kind} slip at ${seconds(both[`${kind}_ns`]).toFixed(4)} s (${from === "truth" ? "truth, simulated" : from})`);
+      if (both[`${kind}_ns`] !== null) known.push(`${kind} slip at ${seconds(both[`${kind}_ns`]).toFixed(4)} s (${from})`);
   place("onsets").textContent = known.join("; ") || "No onsets are known yet: `sliplab label` finds them.";
   plots.show(trial, {});
 });

@@ -3,7 +3,7 @@ import { Frame, KINDS, Panels, seconds } from "./plots.js";
 
 const root = document.querySelector(".trial"), address = root.dataset.address;
 const figure = document.querySelector(".frame"), slider = document.querySelector(".slider");
-const names = { label: "label", suggested: "by the visible markers", review: "review", truth: "truth (simulated)" };
+const names = { label: "label", suggested: "by the visible markers", review: "review" };
 
 const panels = new Panels(root.querySelector(".plots"), { cursor: (time) => frame?.at({ time }) });
 const frame = figure && new Frame(figure, (time) => {
