@@ -152,10 +152,16 @@ class LiveFeed:
             if not self.watched:
                 self._recent = {}
                 continue
-            with suppress(OSError, ImportError):  # a full disk, no library for pictures
+            try:
                 self._write(written, STATE, self._words())
                 if recent := dict(self._recent):
                     self._write(written, PICTURES, json.dumps(self._pictures(recent)))
+            except (OSError, ImportError):  # a full disk, no library for pictures
+                continue
+            except Exception as error:  # a picture is worth no trial
+                console.say(f"warning: the page gets no more pictures: {error!r}")
+                self.watched = False
+                return
 
     def _words(self) -> str:
         request = self._run_request

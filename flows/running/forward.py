@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PREFECT = ("/api", "/v2", "/ui-settings")
 """First parts of the paths that Prefect's server answers."""
 ANSWER_S = 60.0
-"""Longest wait for the begin of an answer, s."""
+"""Longest silence of an answer, s; a stream of events is silent for 15 s at most."""
 LARGEST_BODY = 2_000_000
 """Bytes of a forwarded request."""
 _HOP = frozenset(
@@ -39,12 +39,8 @@ class Forward:
 
     def __init__(self, prefect: ASGIApp, socket: Path) -> None:
         self._prefect = prefect
-        limits = httpx.Timeout(ANSWER_S, connect=2.0, read=None)
-        self._client = httpx.AsyncClient(
-            transport=httpx.AsyncHTTPTransport(uds=str(socket)),
-            base_url="http://web",
-            timeout=limits,
-        )
+        # no client: it would keep one browser's cookies and send them for the next
+        self._line = httpx.AsyncHTTPTransport(uds=str(socket))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request; with the server's life end the connections to the other program."""
@@ -52,7 +48,7 @@ class Forward:
             try:
                 await self._prefect(scope, receive, send)
             finally:
-                await self._client.aclose()
+                await self._line.aclose()
             return
         path = f"{scope.get('path', '')}/"
         if scope["type"] != "http" or path.startswith(tuple(f"{part}/" for part in PREFECT)):
@@ -70,10 +66,12 @@ class Forward:
             body += part
             if len(body) > LARGEST_BODY:
                 return PlainTextResponse(f"more than {LARGEST_BODY} bytes\n", 413)
-        url = httpx.URL(path=request.url.path, query=request.url.query.encode())
+        query = request.url.query.encode()
+        url = httpx.URL("http://web").copy_with(path=request.url.path, query=query or None)
         headers = [pair for pair in request.headers.raw if pair[0] not in _HOP]
-        asked = self._client.build_request(request.method, url, headers=headers, content=body)
-        got = await self._client.send(asked, stream=True)
+        limits = {"timeout": httpx.Timeout(ANSWER_S, connect=2.0).as_dict()}
+        asked = httpx.Request(request.method, url, headers=headers, content=body, extensions=limits)
+        got = await self._line.handle_async_request(asked)
         answer = StreamingResponse(_parts(got), got.status_code)
         answer.raw_headers = [
             (key.lower(), value) for key, value in got.headers.raw if key.lower() not in _HOP

@@ -193,7 +193,9 @@ class Hub:
                 disk=shutil.disk_usage(self._web.store.folder),
             )
             found["problem"] = ""
-            if "now" not in found and not self._seen.get(STATE):
+            written = self._seen.get(STATE, 0) / 1e9
+            killed = status.running is None and time.time() - written > STATUS_S
+            if killed or ("now" not in found and not written):  # killed: the file stayed
                 found["now"] = self._now("")
         return found
 

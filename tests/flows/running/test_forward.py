@@ -28,6 +28,7 @@ async def echo(request: Request) -> Response:
         "path": request.url.path,
         "query": request.url.query,
         "host": request.headers["host"],
+        "cookie": request.headers.get("cookie"),
         "body": (await request.body()).decode(),
     }
     answer = JSONResponse(found, 418)
@@ -88,12 +89,22 @@ def test_other_paths_are_forwarded_whole(socket: Path) -> None:
             "path": "/control/pause",
             "query": "a=b%20c",
             "host": "lab",
+            "cookie": None,
             "body": "x=1",
         }
         assert answer.headers.get_list("set-cookie") == ["a=1", "b=2"]
         trial = client.get("/trials/pilot/depth%3D1mm%2Cr%3D1").json()["path"]
         assert trial == "/trials/pilot/depth=1mm,r=1"
         assert client.post("/", content=b"x" * (LARGEST_BODY + 1)).status_code == 413
+
+
+def test_one_browsers_cookie_is_not_sent_for_another(socket: Path) -> None:
+    app = Forward(prefect(), socket)
+    with web(socket), TestClient(app) as client:
+        for cookie in (None, "a=mine", None):
+            client.cookies.clear()
+            headers = {} if cookie is None else {"cookie": cookie}
+            assert client.get("/", headers=headers).json()["cookie"] == cookie
 
 
 @pytest.mark.parametrize("path", ["/api", "/api/health", "/v2/", "/ui-settings"])

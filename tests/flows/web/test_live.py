@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import os
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
+from sliplab.flows.collecting.live_feed import STATE, LiveFolder
 from sliplab.flows.log import log_entries
 from sliplab.flows.web import live
 from sliplab.flows.web.live import Hub, event
@@ -152,3 +155,16 @@ def test_schedules_show_next_runs(store: Store, tmp_path: Path) -> None:
     assert text.count("07:30 CE") == 5
     file.write_text("timezone: nowhere\nschedules: []\n")
     assert "is not a time zone" in found.get("/schedules").text
+
+
+def test_killed_collection_is_not_shown_as_running(store: Store) -> None:
+    folder = LiveFolder(store.folder)
+    folder.watch()
+    state = {"trial": "gone", "attempt": 1, "phase": "hold", "number": 1, "campaign": "pilot"}
+    state |= {"simulated": True, "rig": "mock", "operator": "", "began": 1.0, "seconds": 9.0}
+    (folder.folder / STATE).write_text(json.dumps({**state, "condition": {}, "lines": []}))
+    hub = Hub(Web(store, ACCESS))
+    with exclusive(store.folder / STORE_LOCK, "the store"):
+        assert "gone" in hub._tick(100.0)["now"]
+    os.utime(folder.folder / STATE, (1.0, 1.0))
+    assert "Nothing runs" in hub._tick(200.0)["now"]
