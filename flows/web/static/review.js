@@ -75,7 +75,7 @@ function rowOf(row, place) {
 const here = () => rows.findIndex((row) => same(row, wanted));
 
 function position() {
-  const at = here(), text = find(".position");
+  const at = rows.findIndex((row) => same(row, shown?.row)), text = find(".position");
   if (text) text.textContent = at < 0 ? "" : `${at + 1} of ${rows.length}`;
 }
 
