@@ -103,6 +103,7 @@ class Hub:
         self._reader = StatusReader(web.store)
         self._viewers: set[_Viewer] = set()
         self._latest: dict[str, str] = {}
+        self._left = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._status: StoreStatus | None = None
         self._read_at = self._curves_at = 0.0
@@ -140,12 +141,15 @@ class Hub:
         for kind, text in self._latest.items():
             viewer.put(kind, text)
         self._viewers.add(viewer)
+        self._left.clear()
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._run())
         try:
             yield viewer
         finally:
             self._viewers.discard(viewer)
+            if not self._viewers:
+                self._left.set()
 
     async def _run(self) -> None:
         """Read and send while somebody watches."""
@@ -161,7 +165,9 @@ class Hub:
                     self._latest[kind] = text
                     for viewer in self._viewers:
                         viewer.put(kind, text)
-            await asyncio.sleep(max(TICK_S - (time.monotonic() - began), TICK_S / 5))
+            rest_s = max(TICK_S - (time.monotonic() - began), TICK_S / 5)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._left.wait(), rest_s)
         # the next viewer gets nothing old
         self._latest, self._seen, self._status, self._last = {}, {}, None, None
         self._curves_at = 0.0
