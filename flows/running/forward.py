@@ -57,7 +57,8 @@ class Forward:
         try:
             answer = await self._ask(Request(scope, receive))
         except (httpx.HTTPError, ClientDisconnect):
-            answer = PlainTextResponse("the page is starting; load it again\n", 503)
+            again = {"refresh": "2"} if scope["method"] == "GET" else {}
+            answer = PlainTextResponse("the page is starting; load it again\n", 503, again)
         await answer(scope, receive, send)
 
     async def _ask(self, request: Request) -> Response:
