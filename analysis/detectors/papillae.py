@@ -102,8 +102,12 @@ class Papillae(Detector):
         return Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
 
     def cost(self) -> Cost:
-        """Return the operations of a millisecond with 20 places, and the bytes of its numbers."""
-        return Cost(operations=20.0 * 12, memory_bytes=8 * 14)
+        """Return the operations of a millisecond with 20 places, and the bytes of its numbers.
+
+        About 30 for each place, and 4 for each cell every 10 ms.
+        """
+        cells = CELLS_ACROSS**2 * 0.75
+        return Cost(operations=20.0 * 30 + 4 * cells / PLACES_MS, memory_bytes=8 * 14)
 
     def _between(self, first: int, last: int) -> slice:
         """Return the events of the milliseconds from `first` on, before `last`."""
