@@ -40,6 +40,7 @@ from sliplab.analysis.networks.models import (
 )
 from sliplab.analysis.report import pages
 from sliplab.analysis.report.classes import class_numbers, class_report_key
+from sliplab.analysis.report.one_camera import marker_numbers
 from sliplab.analysis.report.summary import evaluation_numbers
 from sliplab.analysis.trial_work import EachTrial, KeepTrials, in_order
 from sliplab.analysis.windows.dataset import SampleSet
@@ -431,6 +432,10 @@ class SlipByMarkers(Problem):
     def evaluate(self, job: markers.MarkerJob, parts: Mapping[str, Any]) -> None:
         """See `Problem`."""
         markers.evaluate_markers(job)
+
+    def numbers(self) -> Json:
+        """See `Problem`."""
+        return marker_numbers(self.labels.store, self.campaigns)
 
     def baselines(self) -> baselines.Methods:
         """See `Problem`."""

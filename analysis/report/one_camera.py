@@ -41,6 +41,7 @@ from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import LabelSummary, MotionRate, OneCameraSummary, StepLeftOut
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -140,6 +141,18 @@ def one_camera_summary(
         protocols=protocol_hashes(campaigns),
     )
     return summary if judged is None else with_classifier(summary, store, campaigns, judged)
+
+
+def marker_numbers(store: Store, campaigns: list[Collected]) -> Json:
+    """Return the numbers of the evaluation by markers, under the report's keys, without a report.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    nothing = {item.name: 0 for item in campaigns}
+    numbers = one_camera_summary(store, campaigns, nothing, read_judged(store, campaigns)).to_json()
+    del numbers["planned"]  # that of a report alone
+    return numbers
 
 
 def _not_done(step: str, evaluated: bool, labelled: bool) -> str | None:

@@ -44,6 +44,8 @@ def detect(
         float | None,
         typer.Option(
             "--level",
+            min=-1e9,
+            max=1e9,
             help="Evidence above which a detector of `sliplab bench` says slip; default: set by "
             "the store's validation trials.",
         ),

@@ -87,7 +87,8 @@ class Tracer:
             try:
                 run = original(rig, program, sink, *arguments, **options)
                 with self._notes.open("a") as file:
-                    file.write(f"{sink.folder.name}\n")
+                    writer = getattr(sink, "_sink", sink)  # the page's is around it
+                    file.write(f"{writer.folder.name}\n")
                 return run
             finally:
                 self._moving = False

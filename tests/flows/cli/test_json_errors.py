@@ -28,7 +28,7 @@ GONE = "ROOM/nowhere"
 ALONE = (
     *("plan", "sync", "label", "train", "evaluate", "report", "generalise", "trials"),
     *("holdout", "verify", "migrate", "pause", "resume", "stop", "review", "reflex", "stress"),
-    *("tradeoff", "status", "log"),
+    *("tradeoff", "status", "log", "page"),
 )
 WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
     # command: arguments, and the file, key and value that its error names

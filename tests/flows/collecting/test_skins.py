@@ -181,7 +181,7 @@ def test_a_split_holds_out_a_logged_skin_and_the_report_says_where_skins_mix(
     section = skin_section([mixed])
     assert section is not None
     assert section.skins == ["simulated-1", "0043"]
-    html = render_section(section, simulated=True)[1]
+    html = render_section(section, simulated=True).html
     assert "Trials of 2 skins are pooled" in html
     data = short()
     before = mixed.plan.analysis_hash
@@ -196,7 +196,7 @@ def test_a_split_holds_out_a_logged_skin_and_the_report_says_where_skins_mix(
     section = skin_section([held])
     assert section is not None
     assert (section.mixed, section.unseen) == ([], ["0043"])
-    assert "never saw" in render_section(section, simulated=True)[1]
+    assert "never saw" in render_section(section, simulated=True).html
     assert store.simulated
 
 
