@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.analysis.detectors.registry import CORE
 from sliplab.analysis.study import Finding, Study
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, MedianLatency
 from sliplab.protocols.errors import InputError
@@ -64,6 +63,7 @@ def measure(
     ] = None,
 ) -> Finding[BenchResult]:
     """Judge detectors on simulated scenes: latency at a false alarm an hour, and its cost."""
+    from sliplab.analysis.detectors.registry import CORE
     from sliplab.plugins.bench import PLUGIN
     from sliplab.plugins.bench.plot import latency_against_alarms
     from sliplab.plugins.bench.run import run_bench

@@ -38,6 +38,7 @@ def test_package_that_fails_exits_or_hangs_on_import_is_one_error(
     monkeypatch.setattr(plugins, "LONGEST_S", 0.2 if "while" in text else 60.0)
     name = f"lab_{tmp_path.name.replace('-', '_').replace('[', '_')}"
     (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.delitem(sys.modules, name, raising=False)  # pytest uses a folder's name again
     before = signal.getsignal(plugins._SIGNAL)
     with pytest.raises(PluginError, match=said) as caught:
         import_foreign(f"{name}:DRIVER")
