@@ -261,7 +261,7 @@ def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
             )
     finally:
         link.close()
-    with pytest.raises(ValueError, match="clock back is not simulated"):
+    with pytest.raises(ValueError, match="clock_jump is not simulated"):
         robot.inject(Kind.CLOCK_BACK)
 
 
