@@ -167,10 +167,10 @@ def test_undetected_trials_come_as_often_as_in_the_pilot() -> None:
     assert not any(np.isinf(each[~deepest]).any() for each in drawn)
     missing = np.mean([np.isnan(each).mean() for each in drawn])
     assert missing == pytest.approx(1 / 60, abs=0.01)
-    (found,) = power_of(plan, pilot, 8)
-    assert found.holds > 0.8
+    (found,) = power_of(plan, pilot)
+    assert found.holds > 0.9
     (against,) = power_of(
-        plan_of([{"figure": "latency_gross", "statistic": "p90", "at_most": "100 ms"}]), pilot, 8
+        plan_of([{"figure": "latency_gross", "statistic": "p90", "at_most": "100 ms"}]), pilot
     )
     assert against.holds == 0.0
 
