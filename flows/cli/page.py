@@ -81,9 +81,17 @@ def origin(url: str) -> str:
     """
     from urllib.parse import urlsplit
 
-    parts = urlsplit(url.rstrip("/"))
+    try:
+        parts = urlsplit(url.rstrip("/"))
+        port = parts.port  # raises for a port that is none
+    except ValueError:
+        raise InputError("--public-url", "", url, "must be like https://lab.example") from None
     if url and (
-        parts.scheme not in {"http", "https"} or not parts.netloc or parts.path or parts.query
+        parts.scheme not in {"http", "https"}
+        or not parts.hostname
+        or parts.path
+        or parts.query
+        or port == 0
     ):
         raise InputError("--public-url", "", url, "must be like https://lab.example")
     return url.rstrip("/").lower()

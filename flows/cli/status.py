@@ -86,7 +86,7 @@ def log(
     from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
-    changed = {**_pairs(context or []), **({} if skin is None else {"skin": skin})}
+    changed = _pairs([*(context or []), *([] if skin is None else [f"skin={skin}"])])
     if text is not None or changed:
         _add(opened, text, changed, campaign, who, as_json)
         return
@@ -118,6 +118,8 @@ def _pairs(texts: list[str]) -> dict[str, str]:
         name, equals, value = text.partition("=")
         if not equals:
             raise InputError("--context", "", text, "must be NAME=VALUE, such as operator=anna")
+        if name.strip() in found:
+            raise InputError("--context", "", text, f"gives {name.strip()} twice; give it once")
         found[name.strip()] = value.strip()
     return found
 
