@@ -11,7 +11,7 @@ import time
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.flows.collecting.progress import shown
+from sliplab.flows.collecting.progress import progress_display
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
 from sliplab.flows.collecting.session import TrialCollector, open_session, refresh
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -62,7 +62,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
     request = run_request.content
     several = "trials from " if request.rig.in_virtual_time else "trial "
     with (
-        shown(request) as progress,
+        progress_display(request) as progress,
         open_session(request, progress) as session,
         timed(Store(request.store), f"collect {request.campaign}"),
     ):

@@ -28,8 +28,6 @@ from sliplab.storage.trials.store import Store
 
 F64 = npt.NDArray[np.float64]
 
-BIN_S = 0.03
-"""Bin of the event rate, s: a window of the network."""
 _PHASES = (
     "at rest",
     "from the start of the motion to the first slip",
@@ -168,10 +166,10 @@ def _data(frame_s: F64, displacement_px: F64, event_s: F64, cell: F64) -> dict[s
     for k in range(displacement_px.shape[1]):
         name = "centre marker" if k == 0 else f"marker {k}"
         data[f"{name}, displacement (px)"] = displacement_px[:, k].tolist()
-    count = int(np.ceil(max(float(event_s.max(initial=0.0)), BIN_S) / BIN_S))
-    edges = np.arange(count + 1) * BIN_S
+    count = int(np.ceil(max(float(event_s.max(initial=0.0)), figures.BIN_S) / figures.BIN_S))
+    edges = np.arange(count + 1) * figures.BIN_S
     data["bin of 30 ms, begin (s)"] = edges[:-1].tolist()
-    data["positive events (1/s)"] = (np.histogram(event_s, edges)[0] / BIN_S).tolist()
+    data["positive events (1/s)"] = (np.histogram(event_s, edges)[0] / figures.BIN_S).tolist()
     rows = int(cell.max(initial=0.0)) + 1
     table = np.histogram2d(event_s, cell, [edges, np.arange(rows + 1)])[0]
     for k in range(rows):

@@ -120,9 +120,9 @@ def collect(
     prepare_store(store)
     if run_request.due_trials(Store(store).campaign(run_request.campaign)):
         orchestration.start_server()  # starts while the imports below load
-    from sliplab.flows.collect import collect as run
+    from sliplab.flows.collect import collect as collect_trials
 
-    result = run(run_request)
+    result = collect_trials(run_request)
     if not result["taken"]:
         console.say(
             "nothing to do: all available trials are collected"

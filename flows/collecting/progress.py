@@ -177,7 +177,7 @@ class CollectionProgress(SessionListener):
 
 
 @contextmanager
-def shown(run_request: RunRequest) -> Iterator[CollectionProgress]:
+def progress_display(run_request: RunRequest) -> Iterator[CollectionProgress]:
     """Yield the progress of a collection, and report it to the page of the flow run around it."""
     from prefect.context import FlowRunContext
 

@@ -267,7 +267,7 @@ class TrialCollector:
                 if not self._may_take(trial):
                     continue
                 self._prepare(trial)
-                self._take(trial)
+                self._take_with_retakes(trial)
             self._previous = trial
 
     def fresh_start(self) -> None:
@@ -337,7 +337,7 @@ class TrialCollector:
         if not self.rig.operator.ask(task.request, task.prompt, task.expected):
             raise RigError("operator", f"'{task.prompt}' was not confirmed")
 
-    def _take(self, trial: Trial) -> None:
+    def _take_with_retakes(self, trial: Trial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
         retakes = self.plan.protocol.collection.gates.retakes
         number = self.campaign.attempts().get(trial.id, 0)
@@ -466,9 +466,9 @@ class TrialCollector:
             quality=TrialQuality(passed=found.passed, gates=found.gates),
             steps=tuple(
                 MotionStep(
-                    phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=retained
+                    phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=recorded
                 )
-                for step, retained in run.steps
+                for step, recorded in run.steps
             ),
             geometry=self._geometry(frame_px),
         )

@@ -53,7 +53,7 @@ class DeviceStream:
                 self.device.connect()
 
     def prepare(self) -> None:
-        """Take the present load for zero, where that is done before each trial.
+        """Zero (tare) the device, where that is done before each trial.
 
         The arm is clear of the plate.
         """

@@ -116,7 +116,7 @@ class TrialRun:
     @property
     def recorded_ns(self) -> tuple[int, int]:
         """Start and end of the recorded steps on the arm's clock."""
-        recorded = [step for step, retained in self.steps if retained]
+        recorded = [step for step, is_recorded in self.steps if is_recorded]
         return recorded[0].start_ns, recorded[-1].end_ns
 
 

@@ -25,6 +25,9 @@ from sliplab.analysis.report.figures.style import (
     svg_text,
 )
 
+BIN_S = 0.03
+"""Bin of event rates, s: a window of the network."""
+
 
 def trial_overview(
     frame_s: Array,
@@ -60,8 +63,8 @@ def trial_overview(
             )
             top = middle
         span = float(frame_s[-1]) if len(frame_s) else float(event_s.max(initial=1.0))
-        edges = np.arange(0.0, span + 0.03, 0.03)
-        rate = np.histogram(event_s, edges)[0] / 0.03 / 1000
+        edges = np.arange(0.0, span + BIN_S, BIN_S)
+        rate = np.histogram(event_s, edges)[0] / BIN_S / 1000
         middle.step(edges[:-1], rate, where="post", color=BLUE, lw=0.7)
         middle.set_ylabel("positive events\n(thousand/s)")
         middle.set_ylim(bottom=0)
