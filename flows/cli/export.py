@@ -64,7 +64,8 @@ def export(
         typer.Option(
             "--as",
             help="Form. Of PART: aedat4, dsec, or labels or samples (.csv, .parquet, .json). Of a "
-            "store: croissant, mcap or lerobot. Of a model: onnx or card. Plug-ins add others.",
+            "store: croissant, archive, mcap or lerobot. Of a model: onnx or card. Plug-ins add "
+            "others.",
         ),
     ] = None,
     output: Annotated[

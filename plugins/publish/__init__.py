@@ -7,7 +7,7 @@ from sliplab.protocols.plugin import Plugin
 _HERE = "sliplab.plugins.publish"
 PLUGIN = Plugin(
     commands={"publish": f"{_HERE}.command:app"},
-    exports=dict.fromkeys(("croissant", "mcap", "lerobot"), f"{_HERE}.command:EXPORT"),
+    exports=dict.fromkeys(("croissant", "archive", "mcap", "lerobot"), f"{_HERE}.command:EXPORT"),
     formats={"croissant": f"{_HERE}.imported:CROISSANT"},
     hooks={"layout": f"{_HERE}.imported:LAYOUT"},
 )

@@ -46,6 +46,7 @@ with open(path, "rb") as file:
 `sliplab import campaigns/NAME --store STORE --name NAME` makes a store of them again.
 """,
 }
+_LOADS["archive"] = _LOADS["croissant"]
 _LOADS["lerobot"] = (
     _LOADS["croissant"]
     + """

@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from sliplab.plugins.publish.archive import ONSETS, STREAMS
 from sliplab.plugins.publish.publication import SPLITS, Publication
 from sliplab.plugins.publish.tables import TRIALS
 from sliplab.storage.files import sha256
@@ -169,7 +170,9 @@ def _record_set(table: str, rows: pa.Table) -> Json:
         if known == f"{TRIALS}/split":
             field["references"] = {"field": {"@id": "splits/name"}}
         fields.append(field)
-    key: Any = [{"@id": f"{table}/campaign"}, {"@id": f"{table}/trial"}]
+    own = {ONSETS: "onset", STREAMS: "stream"}
+    keys = ["campaign", "trial", *([own[table]] if table in own else [])]
+    key: Any = [{"@id": f"{table}/{name}"} for name in keys]
     return {
         "@type": "cr:RecordSet",
         "@id": table,

@@ -63,6 +63,7 @@ class Form:
         write: writes one trial into the publication's folder.
         finish: writes what is of all trials, and reports each of them.
         card: a section of the data card about the data.
+        archive: with the slip archive's tables.
     """
 
     path: TrialPath
@@ -70,6 +71,7 @@ class Form:
     write: Callable[[Publication, Campaign, Recording, Path], None]
     finish: Callable[[Publication, Path, Callable[[str], None]], None] | None = None
     card: str = ""
+    archive: bool = False
 
 
 def publish(
@@ -99,7 +101,7 @@ def publish(
             how.write(publication, campaign, recording, folder)
         if how.finish is not None:
             how.finish(publication, folder, on_trial)
-        tables = write_tables(publication, folder, how.path)
+        tables = write_tables(publication, folder, how.path, archive=how.archive)
         (folder / CARD).write_text(data_card(publication, tables, form, how.card), "utf-8")
         write_json_aside(folder / CROISSANT, croissant(publication, tables, folder))
         files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -161,6 +163,7 @@ def forms() -> dict[str, Form]:
     return {
         "croissant": Form(trial_folder, f"/{DATA}", _copy_trial),
         **files,
+        "archive": Form(trial_folder, f"/{DATA}", _copy_trial, archive=True),
         "lerobot": Form(trial_folder, f"/{DATA}", _copy_trial, write_lerobot),
     }
 

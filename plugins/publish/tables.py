@@ -9,6 +9,14 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sliplab.plugins.publish.archive import (
+    ONSET_COLUMNS,
+    ONSETS,
+    STREAM_COLUMNS,
+    STREAMS,
+    onset_table,
+    stream_table,
+)
 from sliplab.plugins.publish.publication import Publication, TrialPath
 from sliplab.protocols.plan import condition_columns
 from sliplab.storage.formats.export_trials import label_table
@@ -59,16 +67,20 @@ _BY_RULE = {
 }
 
 
-def write_tables(publication: Publication, folder: Path, path: TrialPath) -> dict[str, pa.Table]:
+def write_tables(
+    publication: Publication, folder: Path, path: TrialPath, *, archive: bool = False
+) -> dict[str, pa.Table]:
     """Write ``trials.parquet`` and, where there are labels, ``labels.parquet``.
 
     Args:
         path: gives the path of a trial in the publication.
+        archive: also write the slip archive's tables of onsets and streams.
 
     Returns:
         The tables by name; each field's metadata has its ``description``.
 
     Raises:
+        InputError: an archive has no onsets.
         StoreError: a trial is damaged.
     """
     tables = {TRIALS: _trials(publication, path)}
@@ -80,6 +92,9 @@ def write_tables(publication: Publication, folder: Path, path: TrialPath) -> dic
     if len(labels):
         meanings = {name: _label_text(name) for name in labels.columns}
         tables[LABELLED] = _table(labels, meanings)
+    if archive:
+        tables[ONSETS] = _table(onset_table(publication), ONSET_COLUMNS)
+        tables[STREAMS] = _table(stream_table(publication), STREAM_COLUMNS)
     for name, table in tables.items():
         pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
     return tables

@@ -23,6 +23,7 @@ def test_every_form_is_known() -> None:
         "labels",
         "samples",
         "croissant",
+        "archive",
         "mcap",
         "lerobot",
         "onnx",
@@ -51,8 +52,8 @@ def test_former_options_give_the_same_files_and_name_the_new_ones(
     [
         (
             (),
-            "--as: is needed: a store has the forms croissant, mcap, lerobot; a campaign or a "
-            "trial of it, as PART, aedat4, dsec, labels",
+            "--as: is needed: a store has the forms croissant, archive, mcap, lerobot; a campaign "
+            "or a trial of it, as PART, aedat4, dsec, labels",
         ),
         (("--as", "dsek"), "--as = dsek: must be one of"),
         (("--as", "dsec"), "PART: is needed: --as dsec is of a campaign or a trial"),
