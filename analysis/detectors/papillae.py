@@ -133,7 +133,9 @@ class Papillae(Detector):
         """Write the evidence of the milliseconds from `first` on."""
         oldest = first - MEMORY_MS - GAP_MS
         part = self._between(oldest, first + len(value))
-        counts = _counts(self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise)
+        counts = _counts(
+            self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise
+        )
         scale = self._dispersion() ** 2
         _advance(counts, self._noise, self._rest, self._pushed, scale, value)
 
