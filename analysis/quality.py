@@ -302,7 +302,7 @@ def sync_gate(device: str, sync: TrialSync, gates: Gates, timing: Timing) -> Gat
     known = sync.devices.get(device)
     if known is None:
         return Gate(value=sync.refused[device], limit=None, passed=False)
-    # a latency is a difference: both maps count, where there are events
+    # a latency is a difference: the uncertainty of both maps enters, where there are events
     both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
     value = (known.uncertainty_ns if both is None else both) / 1e9
     limit = gates.sync_uncertainty.limit_s(gated_as(known.grade, timing))

@@ -114,7 +114,7 @@ def known_export(name: str) -> Export:
 
 
 def check_export(request: ExportRequest) -> Export:
-    """Return the form of a request that is right.
+    """Return the export of a valid request.
 
     Raises:
         InputError: an option that the form does not take, or a part that is missing or too much.

@@ -10,6 +10,8 @@ from sliplab.protocols.yaml_file import StrictModel
 
 MARGIN = 2.0
 """Spikes by which a class must lead for each of its output neurons: the paper's rule."""
+SPIKE_THRESHOLD = 1.0
+"""Membrane potential at which a neuron fires."""
 Scale = Annotated[float, Field(ge=0, le=1e6)]
 
 

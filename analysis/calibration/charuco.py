@@ -171,13 +171,13 @@ def fit_lens(views: Sequence[Corners], board: Board, size_px: tuple[int, int]) -
     if lean < LEAST_LEAN_DEG:
         raise BoardError(
             f"the boards lean by {lean:.0f} degrees to each other at most, {LEAST_LEAN_DEG:.0f} "
-            "are needed to tell the focal length: lean the board by 20 to 40 degrees"
+            "are needed to tell the focal length: tilt the board by 20 to 40 degrees"
         )
     doubt = float(max(doubts[0] / matrix[0, 0], doubts[1] / matrix[1, 1]))
     if not doubt <= MOST_FOCAL_DOUBT:
         raise BoardError(
-            f"the focal length is known to {100 * doubt:.1f} % only, at most "
-            f"{100 * MOST_FOCAL_DOUBT:.0f} % is allowed: lean the board more, 20 to 40 degrees "
+            f"the focal length is uncertain by {100 * doubt:.1f} %, at most "
+            f"{100 * MOST_FOCAL_DOUBT:.0f} % is allowed: tilt the board more, 20 to 40 degrees "
             "about both axes"
         )
     scale, tilt = _on_plane(matrix, distortion, turns[0], shifts[0], size_px)

@@ -103,8 +103,8 @@ def fit_bounds(
                 raise BoundsContradictError(
                     f"no clock that drifts by at most {max_drift_ppm:g} ppm lies between the "
                     f"bounds of all {device.size} instants: it jumped, or a message took longer "
-                    f"than the rig file says. The slowest took {slowest / 1e3:.0f} us more than "
-                    f"the fastest, the bounds allow {widest / 1e3:.0f} us. Let nothing set a "
+                    f"than the rig file says. The slowest message took {slowest / 1e3:.0f} us more "
+                    f"than the fastest, the bounds allow {widest / 1e3:.0f} us. Let nothing set a "
                     "clock, or raise drift_ppm or the longest delay"
                 )
             ends.append(sign * float(found.fun))

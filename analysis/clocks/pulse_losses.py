@@ -197,7 +197,7 @@ def on_ticks(predicted: Floats, reference: Floats, tick: float, slack_ns: float)
 
 @dataclass(frozen=True)
 class Ends:
-    """Pulses of one train before the other one, and of the other one behind it.
+    """Pulses of one train that precede the other, and of the other that follow it.
 
     Attributes:
         earlier, later: which is which, ``device`` or ``reference``.

@@ -263,7 +263,7 @@ def fit_logistic(features: FloatArray, labels: IntArray, classes: int = len(CLAS
         gradient = x.T @ (np.exp(log_p) - target) / len(x) + penalty * w
         return float(loss), gradient.ravel()
 
-    # sums over threads come out otherwise on another number of them, and waiting costs the most
+    # sums over threads differ between numbers of them, and waiting costs the most
     with threadpool_limits(1):
         found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
     return Logistic(np.asarray(found.x).reshape(shape), mean, scale, int(found.nit))

@@ -95,7 +95,7 @@ class MarkerNet:
                 f"windows of {x.shape[1:]}: this network takes {(FRAMES, self.markers, 2)}"
             )
         z = _inputs(x)
-        # sums over threads come out otherwise on another number of them
+        # sums over threads differ between numbers of them
         with threadpool_limits(1):
             hidden = np.maximum(z @ self.weights[0] + self.biases[0], 0.0)
             return np.asarray(softmax(hidden @ self.weights[1] + self.biases[1], axis=1))

@@ -20,7 +20,7 @@ from sinabs.layers import IAFSqueeze
 from torch import nn
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.network_settings import SPIKE_THRESHOLD, NetworkSettings
 from sliplab.protocols.windows import Windows
 
 WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
@@ -123,10 +123,10 @@ def rates_alone(bias: torch.Tensor, steps: int) -> torch.Tensor:
 
 
 def _iaf(steps: int) -> IAFSqueeze:
-    """One spike a step at most, reset to zero, no lower bound; threshold 1."""
+    """One spike a step at most, reset to zero, no lower bound."""
     return IAFSqueeze(
         num_timesteps=steps,
-        spike_threshold=torch.tensor(1.0),
+        spike_threshold=torch.tensor(SPIKE_THRESHOLD),
         spike_fn=SingleSpike,
         reset_fn=MembraneReset(),
         surrogate_grad_fn=SingleExponential(),

@@ -247,7 +247,7 @@ def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:
         if fits.any():
             at = int(fits.argmax())
             return int(tried[at]), tuple(int(m) for m in multiple[at])
-    raise ValueError(f"thresholds {list(thresholds)}: no common one below {MOST}")
+    raise ValueError(f"thresholds {list(thresholds)}: no common multiple below {MOST}")
 
 
 def common_net(fitted: Fitted, found: Quantised) -> nn.Sequential:

@@ -69,7 +69,7 @@ def several(campaigns: list[Collected]) -> list[str]:
 def load_samples(
     labels: StoreLabels, campaigns: list[Collected], split: str, each: EachTrial = in_order
 ) -> SampleSet:
-    """Load the samples of all trials of one split of the kinematic campaigns, mapped from a file.
+    """Load the samples of all trials of one split of the kinematic campaigns, memory-mapped.
 
     Args:
         each: makes what is missing; in this process a trial takes 10 ms.

@@ -109,9 +109,9 @@ def calibrate_lens(
         worst = int(fit.used[int(fit.residuals_px.argmax())]) + 1
         raise RigError(
             "frame camera",
-            f"corners are off by {fit.residual_px:.2f} px (root mean square), most in picture "
-            f"{worst}: at most {MOST_LENS_PX:g} px is good. Is the board flat and the picture "
-            "sharp? Nothing was written",
+            f"the reprojection error is {fit.residual_px:.2f} px (root mean square), largest in "
+            f"picture {worst}: at most {MOST_LENS_PX:g} px is allowed. Is the board flat and the "
+            "picture sharp? Nothing was written",
         )
     focal, centre = fit.matrix[[0, 1], [0, 1]], fit.matrix[:2, 2]
     scale = round(fit.scale_px_per_mm, 5)

@@ -345,17 +345,16 @@ class _Work:
 
     def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
         self._do, self._link = do, link
-        self.on_start: Callable[[], None] = lambda: None
         self.started = self._done = False
         self._result: Any = None
         self.error: BaseException | None = None
 
-    def do(self, argument: Any) -> Any:
-        """Do it, and keep its result or its error."""
+    def do(self, argument: Any, on_start: Callable[[], None] = lambda: None) -> Any:
+        """Do it after `on_start`, and keep its result or its error."""
         self.started = True
         try:
             with stopping.signals():  # around a flow Prefect has its own handler of SIGTERM
-                self.on_start()
+                on_start()
                 self._result = self._do(argument)
                 self._done = True
         except BaseException as error:
@@ -444,12 +443,15 @@ def _reported(
     from prefect.exceptions import CancelledRun, PausedRun, PrefectSignal, TerminationSignal
     from prefect.flow_engine import run_flow
 
-    def do(argument: Opaque[Any]) -> Any:
-        return work.do(argument)
-
     store, run_id = _store, str(flow_run.id)
-    if store is not None:
-        work.on_start = lambda: run_records.begin(store, run_id, flow.name, link.server)
+
+    def begin() -> None:
+        if store is not None:
+            run_records.begin(store, run_id, flow.name, link.server)
+
+    def do(argument: Opaque[Any]) -> Any:
+        return work.do(argument, begin)
+
     reported_flow: Any = Flow(
         do,
         name=flow.name,

@@ -72,7 +72,7 @@ class Access:
         return Access({role: secrets.token_urlsafe(32) for role in ROLES})
 
     def role_of(self, token: str) -> Role | None:
-        """Return whose link has this token; None for no one's."""
+        """Return the role that this token gives, or None."""
         for role in ROLES:
             if hmac.compare_digest(self.tokens[role].encode(), token.encode()):
                 return role

@@ -168,7 +168,7 @@ class Hub:
             rest_s = max(TICK_S - (time.monotonic() - began), TICK_S / 5)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._left.wait(), rest_s)
-        # the next viewer gets nothing old
+        # the next viewer must not see an old state
         self._latest, self._seen, self._status, self._last = {}, {}, None, None
         self._curves_at = 0.0
 

@@ -272,7 +272,7 @@ def export_files(
         contents by the ending of the file's name, and the figures.
 
     Raises:
-        InputError: the store's windows are others than the model's, or its classes are not those
+        InputError: the store's windows differ from the model's, or its classes are not those
             of slip.
         StoreError: not labelled.
         ExportFailed: the ONNX file gives other counts.

@@ -40,7 +40,7 @@ def export_model(
         checked: windows to check it on.
 
     Raises:
-        InputError: the store's windows are others than the model's.
+        InputError: the store's windows differ from the model's.
         StoreError: nothing collected, or not labelled.
         ExportFailed: the ONNX file gives other counts.
         ModuleNotFoundError: the extra ``onnx`` is not installed.

@@ -199,7 +199,7 @@ class EventCamera(Protocol):
         """Stop streaming."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 @runtime_checkable
@@ -226,7 +226,7 @@ class FrameCamera(Protocol):
         """Stop grabbing."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 @runtime_checkable
@@ -256,7 +256,7 @@ class SyncBox(Protocol):
         """Stop the ticks; the clock keeps running."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 @dataclass(frozen=True)
@@ -297,13 +297,13 @@ class ForceSensor(Protocol):
         """
 
     def zero(self) -> None:
-        """Take the present load for zero from now on."""
+        """Zero (tare) the sensor at the present load."""
 
     def stop(self) -> None:
         """Stop streaming; what has come can still be read."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 @runtime_checkable
@@ -496,4 +496,4 @@ class Simulation(Protocol):
         """Keep the forces on the plate from now on, for `plate_course`, until the trial ends."""
 
     def plate_course(self, since_arm_ns: int) -> PlateCourse:
-        """Return heights, forces and depths since an arm controller time, after `watch_plate`."""
+        """Return what was recorded since an arm controller time, after `watch_plate`."""

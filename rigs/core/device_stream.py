@@ -72,7 +72,7 @@ class DeviceStream:
             self.device.stop()
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         self.device.close()
 
     def drain(self, sink: Sink) -> None:

@@ -27,8 +27,8 @@ TAPS = (0, 1, 2, 22)
 """Taps of the Fibonacci register with the primitive polynomial x^32 + x^22 + x^2 + x + 1."""
 LONGEST_GAP_TICKS = 32
 """Longest gap between two pulses of any code; firmware with an older code may exceed it."""
-SHORTEST_TICKS, LONGEST_TICKS = 2, 9
-"""Shortest and longest interval of the code `irregular`."""
+SHORTEST_TICKS = 2
+"""Shortest interval of the code `irregular`; the longest one has 9."""
 REGULAR_TICKS = 2
 """Interval between the later pulses of the code `regular`."""
 PULSE_NS = 5_000_000

@@ -85,7 +85,7 @@ def slide_onsets(
         relaxing = maxwell * k_t * speed * tau * -np.expm1(-t_s / tau)
         return spring + relaxing - mu * normal
 
-    # stretched to twice this a tip would pull with more than its linear limit
+    # stretched to twice this a tip would exceed its linear friction limit
     high = 4.0 * np.max(mu * skin.normal_n_per_mm * deep / k_t, axis=-1, keepdims=True) / speed
     high = np.broadcast_to(high + 1.0, np.broadcast_shapes(high.shape, deep.shape))
     low = np.zeros(high.shape)

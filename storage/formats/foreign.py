@@ -95,11 +95,11 @@ def read_head(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class ForeignChunk(EventChunk):
-    """Events of a foreign file, which may run back in time.
+    """Events of a foreign file, whose times may be out of order.
 
     Attributes:
         left_out: numbers of events that cannot be right and are left out, by reason.
-        resolution_us: of the type of its times at the latest one, us; 0 for integers.
+        resolution_us: spacing of its floating-point times at the last one, us; 0 for integers.
     """
 
     left_out: Mapping[str, int] = field(default_factory=dict)

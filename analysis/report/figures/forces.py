@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 from sliplab.analysis.report.figures.style import (
     BLUE,
     GREY,
+    ONSET_COLOURS,
     ORANGE,
     RED,
     STYLE,
@@ -40,7 +41,7 @@ def force_overview(
         left.plot(time_s, normal_n, color=BLUE, lw=1.2, label="normal")
         left.plot(time_s, tangential_n, color=RED, lw=1.2, label="along the plate")
         for which, style in ((onsets_s, "-"), (knees_s, ":")):
-            for onset, colour in zip(which, (ORANGE, RED), strict=True):
+            for onset, colour in zip(which, ONSET_COLOURS, strict=True):
                 if onset is not None:
                     left.axvline(onset, color=colour, lw=1.1, ls=style)
         left.plot([], [], color="black", lw=1.1, label="onsets: label")

@@ -29,6 +29,8 @@ PALETTE = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
 """For lines and points of one figure, in this order."""
 Array = npt.NDArray[Any]
 CLASS_COLOURS = (BLUE, ORANGE, RED)
+ONSET_COLOURS = CLASS_COLOURS[1:]
+"""Of incipient and gross slip."""
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
 WIDTH = 6.4
 """Inches: still readable when a telephone shrinks it."""

@@ -16,6 +16,7 @@ from sliplab.analysis.report.figures.style import (
     CLASS_WORDS,
     GREEN,
     GREY,
+    ONSET_COLOURS,
     ORANGE,
     RED,
     STYLE,
@@ -72,12 +73,12 @@ def trial_overview(
         for axes in dict.fromkeys((top, middle, low)):
             if motion_s is not None:
                 axes.axvline(motion_s, color=GREEN, lw=1, ls="--")
-            for onset, colour in zip(onsets_s, (ORANGE, RED), strict=True):
+            for onset, colour in zip(onsets_s, ONSET_COLOURS, strict=True):
                 if onset is not None:
                     axes.axvline(onset, color=colour, lw=1.2)
         if motion_s is not None:
             top.plot([], [], color=GREEN, lw=1, ls="--", label="motion begins")
-        for name, colour in zip(names, (ORANGE, RED), strict=True):
+        for name, colour in zip(names, ONSET_COLOURS, strict=True):
             top.plot([], [], color=colour, lw=1.2, label=name)
         handles, titles = top.get_legend_handles_labels()
         figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
@@ -118,10 +119,10 @@ def outputs(
             for index, colour in enumerate(CLASS_COLOURS):
                 panel.plot(end_s, values[:, index], color=colour, lw=0.9, label=CLASS_WORDS[index])
             panel.set_ylabel(f"{name} output\n(spikes in a window)")
-            for onset, colour in zip(onsets_s, (ORANGE, RED), strict=True):
+            for onset, colour in zip(onsets_s, ONSET_COLOURS, strict=True):
                 if onset is not None:
                     panel.axvline(onset, color=colour, lw=1.4)
-            for found, colour in zip(detected_s, (ORANGE, RED), strict=True):
+            for found, colour in zip(detected_s, ONSET_COLOURS, strict=True):
                 if found is not None:
                     panel.axvline(found, color=colour, lw=1.2, ls=":")
         axes[0].plot([], [], color="black", lw=1.4, label="labelled onset")

@@ -80,7 +80,7 @@ class LabCamera:
             self._buffer.end()
 
     def close(self) -> None:
-        """Give the device back; at any time and more than once."""
+        """Release the device; idempotent."""
         self.stop()
         self._buffer.fail("it is closed")
         with suppress(OSError):

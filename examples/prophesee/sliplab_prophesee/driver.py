@@ -73,7 +73,7 @@ class Prophesee:
             self._switch(False)
 
     def close(self) -> None:
-        """Give the device back; at any time and more than once."""
+        """Release the device; idempotent."""
         self.stop()
         with self._changed:
             self._closed = True

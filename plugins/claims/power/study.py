@@ -107,7 +107,7 @@ def measure(
 
 
 def forecast(plan: Plan, pilot: Store) -> Forecast:
-    """Return what a pilot foretells of a plan's claims, for `sliplab plan`.
+    """Return what a pilot predicts of a plan's claims, for `sliplab plan`.
 
     Raises:
         InputError: the plan has no claims, or the pilot cannot tell.

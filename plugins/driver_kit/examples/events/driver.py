@@ -76,7 +76,7 @@ class ExampleEvents:
             self._send(STOP)
 
     def close(self) -> None:
-        """Give the device back; at any time and more than once."""
+        """Release the device; idempotent."""
         self._buffer.fail("it is closed")
         self._disconnect()
         self._thread.join(ANSWER_S)

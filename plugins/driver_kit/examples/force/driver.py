@@ -87,7 +87,7 @@ class ExampleForce:
             self._send(STOP)
 
     def close(self) -> None:
-        """Give the device back; at any time and more than once."""
+        """Release the device; idempotent."""
         self._buffer.fail("it is closed")
         link, self._socket = self._socket, None
         if link is not None:

@@ -86,7 +86,7 @@ class ExampleFrames:
             self._send(STOP)
 
     def close(self) -> None:
-        """Give the device back; at any time and more than once."""
+        """Release the device; idempotent."""
         self._buffer.fail("it is closed")
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)

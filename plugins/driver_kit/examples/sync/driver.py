@@ -89,7 +89,7 @@ class ExampleSync:
             self._ask("STOP")
 
     def close(self) -> None:
-        """Stop the ticks, and give the device back; at any time and more than once."""
+        """Stop the ticks and release the device; idempotent."""
         self.stop()
         self._buffer.fail("it is closed")
         link, self._socket = self._socket, None
