@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -14,8 +14,11 @@ CHUNK_US = 1_000_000
 """Events given at once: in larger chunks a scene passes faster."""
 
 
-def feed(detector: Detector, scene: Scene, chunk_us: int = CHUNK_US) -> Evidence:
+def feed(detector: Detector, scene: Scene, edges_us: Sequence[int] | None = None) -> Evidence:
     """Return a detector's evidence on a scene.
+
+    Args:
+        edges_us: moments up to which events are given at once; default: each second.
 
     Raises:
         DetectorError: the evidence is invalid, or for a time that was not requested.
@@ -24,14 +27,19 @@ def feed(detector: Detector, scene: Scene, chunk_us: int = CHUNK_US) -> Evidence
     return Evidence.joined(
         [
             checked_of(scene, detector.push(events, until_us), before_us, until_us)
-            for events, before_us, until_us in chunks(scene, chunk_us)
+            for events, before_us, until_us in chunks(scene, edges_us or steady(scene, CHUNK_US))
         ]
     )
 
 
-def chunks(scene: Scene, chunk_us: int) -> Iterator[tuple[EventChunk, int, int]]:
+def steady(scene: Scene, chunk_us: int) -> list[int]:
+    """Return the edges of chunks of one length; the last one may be shorter."""
+    return [*range(chunk_us, scene.end_us, chunk_us), scene.end_us]
+
+
+def chunks(scene: Scene, edges_us: Sequence[int]) -> Iterator[tuple[EventChunk, int, int]]:
     """Yield a scene's events with the times from which and up to which they are complete."""
-    edges = [*range(0, scene.end_us, chunk_us), scene.end_us]
+    edges = [0, *edges_us]
     cuts = np.searchsorted(scene.events.t_us, edges)
     every = scene.events
     for k, (before_us, until_us) in enumerate(pairwise(edges)):

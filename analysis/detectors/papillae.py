@@ -20,16 +20,19 @@ Every millisecond:
    section 4.5). An object that brushes over single papillae changes their shares all the time. The
    quarter of the places that differ most are left out: they may be the tips that slide.
 
-Evidence is the largest statistic of all places; 0 while fewer than `FEWEST_PLACES` of them move.
+Evidence is the largest statistic of all places from `LEAST` on; 0 below, and while fewer than
+`FEWEST_PLACES` of them move.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
+from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
 BIN_US = 1000
@@ -54,6 +57,8 @@ AT_REST, DISTURBED = 0.1, 2.0
 """Rates of a place whose tip slides, and of one that is pushed, by what it had before."""
 SUSPECTED = 6.0
 """Statistic from which a place does not count as one of the others."""
+LEAST = 13.0
+"""Statistic below which nothing is evidence: a knock against the arm reaches up to this."""
 LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
 MOST = 0.95
@@ -65,6 +70,7 @@ REMAINING_MEAN = 0.368
 distribution function of chi-squared with 3 degrees of freedom."""
 
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
 
 
 class Papillae(Detector):
@@ -77,7 +83,7 @@ class Papillae(Detector):
         self._done = 0
         self._ms, self._cell = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._place = np.full(self._shape[0] * self._shape[1], -1)
-        self._rest, self._pushed = np.zeros(0), np.zeros(0)
+        self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
@@ -92,7 +98,10 @@ class Papillae(Detector):
             if at % PLACES_MS == 0:
                 self._find_places(at)
             end = min(at - at % PLACES_MS + PLACES_MS, last)
-            value[at - first : end - first] = self._advance(at, end)
+            if len(self._rest) >= FEWEST_PLACES:
+                self._advance(at, value[at - first : end - first])
+            else:
+                self._rest[:] = self._pushed[:] = 0.0
             if end % PLACES_MS == 0:
                 self._measure_dispersion(end)
             at = end
@@ -113,65 +122,22 @@ class Papillae(Detector):
         """Return the events of the milliseconds from `first` on, before `last`."""
         return slice(*np.searchsorted(self._ms, (first, last)))
 
-    def _counts(self, first: int, last: int) -> F64:
-        """Return the events of each place in each millisecond, (last - first, places)."""
-        found = self._between(first, last)
-        place, places = self._place[self._cell[found]], len(self._rest)
-        inside = place >= 0
-        key = (self._ms[found][inside] - first) * places + place[inside]
-        counts = np.bincount(key, minlength=(last - first) * places)
-        return counts.reshape(last - first, places).astype(np.float64)
-
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
         seen = self._cell[self._between(at - SEEN_MS, at)]
         events = np.bincount(seen, minlength=len(self._place))
-        noise = float(np.median(events))
-        above = events >= noise + NOISE_DEVIATIONS * np.sqrt(noise) + CELL_EVENTS
-        joined, _ = ndimage.label(above.reshape(self._shape), np.ones((3, 3)))
-        place = joined.ravel() - 1
-        size = np.bincount(place[place >= 0])
-        number = np.where(size >= PLACE_CELLS, np.cumsum(size >= PLACE_CELLS) - 1, -1)
-        place = np.where(place >= 0, np.append(number, -1)[place], -1)
-        places = int(number.max(initial=-1)) + 1
-        total = np.bincount(place[place >= 0], events[place >= 0], places)
-        both = (place >= 0) & (self._place >= 0)
+        found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
+        self._place, self._rest, self._pushed, self._noise = found
 
-        def carried(statistic: F64) -> F64:
-            sums = np.bincount(place[both], events[both] * statistic[self._place[both]], places)
-            return sums / total
-
-        self._rest, self._pushed = carried(self._rest), carried(self._pushed)
-        self._place = place
-        self._noise = np.bincount(place[place >= 0], minlength=places) * noise / SEEN_MS
-
-    def _advance(self, first: int, last: int) -> F64:
-        """Return the evidence of the milliseconds from `first` on, before `last`."""
-        value = np.zeros(last - first)
-        if len(self._rest) < FEWEST_PLACES:
-            self._rest[:] = self._pushed[:] = 0.0
-            return value
-        now = self._counts(first, last)
+    def _advance(self, first: int, value: F64) -> None:
+        """Write the evidence of the milliseconds from `first` on."""
         oldest = first - MEMORY_MS - GAP_MS
-        sums = np.cumsum(self._counts(oldest, last - GAP_MS), axis=0)
-        memory = sums[MEMORY_MS - 1 : MEMORY_MS - 1 + len(value)].copy()
-        memory[1:] -= sums[: len(value) - 1]
-        dispersion = self._dispersion()
-        for k, (n, w) in enumerate(zip(now, memory, strict=True)):
-            moving = w >= FEWEST_EVENTS
-            w = np.maximum(w, 1.0)
-            others = moving & (self._rest < SUSPECTED) & (self._pushed < SUSPECTED)
-            if moving.sum() < FEWEST_PLACES or not others.any():
-                self._rest[:] = self._pushed[:] = 0.0
-                continue
-            total = n[others].sum() + np.where(others, 0.0, n)
-            share = np.minimum(w / (w[others].sum() + np.where(others, 0.0, w)), MOST)
-            at_rest = np.minimum(AT_REST + (1 - AT_REST) * self._noise * MEMORY_MS / w, MOST)
-            self._rest = _page(self._rest, at_rest, n, total, share) * moving
-            pushed = _page(self._pushed, DISTURBED, n, total, np.minimum(share, MOST / DISTURBED))
-            self._pushed = np.minimum(pushed, LARGEST) * moving
-            value[k] = self._rest.max() / dispersion**2
-        return value
+        part = self._between(oldest, first + len(value))
+        counts = _counts(
+            self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise
+        )
+        scale = self._dispersion() ** 2
+        _advance(counts, self._noise, self._rest, self._pushed, scale, value)
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""
@@ -182,8 +148,13 @@ class Papillae(Detector):
         """Compare the shares of the places in the last 10 ms with those of the memory."""
         found = np.nan
         if len(self._rest) >= FEWEST_PLACES:
-            n = self._counts(end - PLACES_MS, end).sum(axis=0)
-            w = self._counts(end - MEMORY_MS - GAP_MS, end - GAP_MS).sum(axis=0)
+            oldest = end - PLACES_MS - MEMORY_MS - GAP_MS
+            part = self._between(oldest, end)
+            counts = _counts(
+                self._ms[part], self._cell[part], oldest, PLACES_MS, self._place, self._noise
+            )
+            n = counts[-PLACES_MS:].sum(axis=0)
+            w = counts[PLACES_MS:-GAP_MS].sum(axis=0)
             n, w = n[w >= FEWEST_EVENTS], w[w >= FEWEST_EVENTS]
             if len(w) >= FEWEST_PLACES and n.sum() > 0:
                 expected = n.sum() * w / w.sum()
@@ -192,8 +163,124 @@ class Papillae(Detector):
         self._dispersions = np.append(self._dispersions[1:], found)
 
 
-def _page(statistic: F64, ratio: F64 | float, n: F64, total: F64, share: F64) -> F64:
+@njit(cache=True, nogil=True)
+def _places(
+    events: I64, columns: int, before: I64, rest: F64, pushed: F64
+) -> tuple[I64, F64, F64, F64]:
+    """Return the place of each cell, -1 for none, and the places' statistics and noise.
+
+    Args:
+        events: of each cell, row by row. before: the cells' former places.
+        rest, pushed: statistics of the former places.
+    """
+    noise = _median(events)
+    least = noise + NOISE_DEVIATIONS * math.sqrt(noise) + CELL_EVENTS
+    place = np.full(len(events), -1)
+    stack, members = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
+    new_rest, new_pushed = np.zeros(len(events)), np.zeros(len(events))
+    new_noise = np.zeros(len(events))
+    places = 0
+    for start in range(len(events)):
+        if events[start] < least or place[start] != -1:
+            continue
+        place[start], stack[0], waiting, size = places, start, 1, 0
+        while waiting > 0:  # all cells that touch each other
+            waiting -= 1
+            cell = stack[waiting]
+            members[size] = cell
+            size += 1
+            row, column = cell // columns, cell % columns
+            for other_row in range(max(row - 1, 0), min(row + 2, len(events) // columns)):
+                for other_column in range(max(column - 1, 0), min(column + 2, columns)):
+                    other = other_row * columns + other_column
+                    if events[other] >= least and place[other] == -1:
+                        place[other] = places
+                        stack[waiting] = other
+                        waiting += 1
+        if size < PLACE_CELLS:
+            place[members[:size]] = -2
+            continue
+        total = 0.0
+        for cell in members[:size]:
+            total += events[cell]
+            if before[cell] >= 0:
+                new_rest[places] += events[cell] * rest[before[cell]]
+                new_pushed[places] += events[cell] * pushed[before[cell]]
+        new_rest[places] /= total
+        new_pushed[places] /= total
+        new_noise[places] = size * noise / SEEN_MS
+        places += 1
+    return place, new_rest[:places], new_pushed[:places], new_noise[:places]
+
+
+@njit(cache=True, nogil=True)
+def _median(counts: I64) -> float:
+    """Return the median of counts, most of which are small."""
+    number = np.zeros(counts.max() + 1, np.int64)
+    for count in counts:
+        number[count] += 1
+    lower, upper = (len(counts) - 1) // 2, len(counts) // 2
+    found, below = 0.0, 0
+    for count in range(len(number)):
+        for place in (lower, upper):
+            if below <= place < below + number[count]:
+                found += count / 2
+        below += number[count]
+        if below > upper:
+            break
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _counts(ms: I64, cell: I64, oldest: int, number: int, place: I64, noise: F64) -> I64:
+    """Return the events of each place in `number` milliseconds and the memory before them."""
+    counts = np.zeros((number + MEMORY_MS + GAP_MS, len(noise)), np.int64)
+    for k in range(len(ms)):
+        if place[cell[k]] >= 0:
+            counts[ms[k] - oldest, place[cell[k]]] += 1
+    return counts
+
+
+@njit(cache=True, nogil=True)
+def _advance(counts: I64, noise: F64, rest: F64, pushed: F64, scale: float, value: F64) -> None:
+    """Advance the statistics of the places, and write the evidence.
+
+    Args:
+        counts: as of `_counts`. noise: events a millisecond of each place.
+        rest, pushed: statistics, which are changed. scale: square of the dispersion.
+        value: of each millisecond.
+    """
+    places = len(rest)
+    memory = counts[: MEMORY_MS - 1].sum(axis=0)
+    for k in range(len(value)):
+        memory += counts[k + MEMORY_MS - 1]
+        n = counts[k + MEMORY_MS + GAP_MS]
+        moving = memory >= FEWEST_EVENTS
+        others = moving & (rest < SUSPECTED) & (pushed < SUSPECTED)
+        if moving.sum() < FEWEST_PLACES or not others.any():
+            rest[:] = 0.0
+            pushed[:] = 0.0
+        else:
+            all_n, all_w = n[others].sum(), memory[others].sum()
+            for j in range(places):
+                if not moving[j]:
+                    rest[j] = pushed[j] = 0.0
+                    continue
+                w = float(memory[j])
+                alone = 0 if others[j] else 1
+                total = all_n + alone * n[j]
+                share = min(w / (all_w + alone * w), MOST)
+                silent = min(AT_REST + (1 - AT_REST) * noise[j] * MEMORY_MS / w, MOST)
+                rest[j] = _page(rest[j], silent, n[j], total, share)
+                moved = _page(pushed[j], DISTURBED, n[j], total, min(share, MOST / DISTURBED))
+                pushed[j] = min(moved, LARGEST)
+            most = rest.max() / scale
+            value[k] = most if most >= LEAST else 0.0
+        memory -= counts[k]
+
+
+@njit(cache=True, nogil=True)
+def _page(statistic: float, ratio: float, n: float, total: float, share: float) -> float:
     """Advance Page's test of `ratio` times a share, against the share, by binomial counts."""
-    rest = np.log((1 - ratio * share) / (1 - share))
-    advanced: F64 = np.maximum(statistic + n * np.log(ratio) + (total - n) * rest, 0.0)
-    return advanced
+    silent = math.log((1 - ratio * share) / (1 - share))
+    return max(statistic + n * math.log(ratio) + (total - n) * silent, 0.0)

@@ -1,4 +1,4 @@
-"""Alarms of evidence above a level, and the level of a rate of false ones.
+"""Alarms of evidence above a level, and the level that promises a rate of false ones.
 
 Evidence above the level is an alarm. It lasts a second, in which the detector says nothing else;
 evidence that is above the level afterwards is the next alarm. So a detector that always triggers
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.detectors.detector import Evidence, Slip
+from sliplab.analysis.metrics.alarm_rates import alarm_rate
+from sliplab.storage.schema.evaluation import AlarmRate
 
 ALARM_US = 1_000_000
 US_PER_HOUR = 3_600_000_000
@@ -100,3 +102,62 @@ def level_at(scenes: Sequence[SceneEvidence], allowed: int) -> float:
         middle = (low + high) // 2
         low, high = (low, middle) if fits(levels[middle]) else (middle + 1, high)
     return float(levels[low])
+
+
+def worlds_of(scenes: Sequence[SceneEvidence]) -> list[str]:
+    """Return the world of each scene; one that shares none has its place as a name."""
+    return [scene.world or f"scene {place}" for place, scene in enumerate(scenes)]
+
+
+def false_alarm_rate(scenes: Sequence[SceneEvidence], level: float) -> AlarmRate:
+    """Return the rate of false alarms at a level, with its interval over worlds."""
+    _, world = np.unique(worlds_of(scenes), return_inverse=True)
+    counts = np.bincount(world, [outcome(scene, level).false for scene in scenes])
+    times = np.bincount(world, [hours_without_slip([scene]) for scene in scenes])
+    return alarm_rate(counts, times)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level of evidence, set on validation scenes.
+
+    Attributes:
+        asked: false alarms an hour.
+        allowed: false alarms of all validation scenes at the level, at the most.
+        promised: the upper end of their rate's 95 % interval is at most `asked`. If not, there
+            were too few hours for that, and the level is that without a false alarm.
+    """
+
+    asked: float
+    allowed: int
+    value: float
+    promised: bool
+
+
+def promised_levels(scenes: Sequence[SceneEvidence], rates: Sequence[float]) -> list[Level]:
+    """Return the lowest level that promises each rate of false alarms.
+
+    A level promises a rate if the upper end of the 95 % interval over the scenes' worlds
+    (`analysis.metrics.intervals.rate_interval`) is not above it. Levels are tried from the highest
+    one down to the first that fails, one for each number of allowed alarms of a series that does
+    not depend on the scenes: so the choice errs no more often than one interval does (fixed
+    sequence testing; Angelopoulos et al. 2021, arXiv 2110.01052, section 2.3).
+    """
+    tried: list[tuple[int, float, float]] = []  # allowed alarms, level, upper end of the rate
+
+    def trial(place: int) -> tuple[int, float, float]:
+        while place >= len(tried):
+            allowed = max(tried[-1][0] + 1, tried[-1][0] * 5 // 4) if tried else 0
+            level = level_at(scenes, allowed)
+            high = false_alarm_rate(scenes, level).high
+            tried.append((allowed, level, np.inf if high is None else high))
+        return tried[place]
+
+    found = []
+    for rate in rates:
+        kept = 0
+        while trial(kept)[2] <= rate and (kept == 0 or np.isfinite(trial(kept - 1)[1])):
+            kept += 1
+        allowed, level, _ = trial(max(kept - 1, 0))
+        found.append(Level(rate, allowed, level, promised=kept > 0))
+    return found

@@ -1,66 +1,55 @@
-"""Auditing a detector: its evidence may not depend on the size of chunks; and its time."""
+"""Auditing a detector: its alarms may not depend on how much it is given at once."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
-from sliplab.analysis.detectors.feeding import CHUNK_US, checked_of, chunks, feed
+from sliplab.analysis.detectors.feeding import feed, steady
 
-FINE_US = 10_000
-"""Events given at once where causality and time are checked, as a live stream would come."""
+COARSE_US = 20_000, 100_000
+"""Shortest and longest chunk in which test scenes are given; each length is drawn."""
+FINE_US = 5_000
+"""The same where causality is checked and decisions are timed, as a live stream would come."""
 TOLERANCE = 1e-3
-"""Evidence may differ by this share between chunk sizes: matrix products round otherwise."""
+"""Share of a level by which evidence may differ: matrix products of other sizes round otherwise."""
 
 
-@dataclass(frozen=True)
-class Audit:
-    """A scene that was fed in fine chunks.
-
-    Attributes:
-        decision_us: median time of a chunk that brought decisions, over their number.
-        evidence: what was answered.
-    """
-
-    decision_us: float
-    evidence: Evidence
+def drawn_edges(scene: Scene, seed: int) -> list[int]:
+    """Return the edges of a test scene's chunks, which no detector can foresee."""
+    most = scene.end_us // COARSE_US[0] + 1
+    lengths = np.random.default_rng(seed).integers(*COARSE_US, most, endpoint=True)
+    edges = np.cumsum(lengths)
+    return [*edges[edges < scene.end_us].tolist(), scene.end_us]
 
 
-def audit(detector: Detector, scene: Scene) -> Audit:
-    """Feed a scene in fine chunks, and measure the time of decisions.
+def audit(
+    detector: Detector, scene: Scene, expected: Evidence, levels: Sequence[float]
+) -> Evidence:
+    """Return a detector's evidence in fine chunks.
+
+    Args:
+        expected: what it answered to other chunks.
+        levels: above which evidence is an alarm.
 
     Raises:
-        DetectorError: as `feed`, or the evidence depends on the size of chunks, so that it may rest
-            on events that come later.
+        DetectorError: as `feed`; or an alarm at one of the levels depends on the size of chunks, so
+            that it may rest on events that come later.
     """
-    expected = feed(detector, scene)
-    detector.begin(scene.width, scene.height)
-    parts, seconds = [], []
-    for events, before_us, until_us in chunks(scene, FINE_US):
-        start = time.perf_counter()
-        answer = detector.push(events, until_us)
-        taken = time.perf_counter() - start
-        parts.append(checked_of(scene, answer, before_us, until_us))
-        if len(answer):
-            seconds.append(taken / len(answer))
-    found = Evidence.joined(parts)
-    if not _same(expected, found):
-        raise DetectorError(
-            f"{scene.name}: evidence is other in chunks of {FINE_US // 1000} ms than in chunks of "
-            f"{CHUNK_US // 1000} ms; it must depend on earlier events alone"
-        )
-    return Audit(1e6 * float(np.median(seconds)) if seconds else 0.0, found)
+    found = feed(detector, scene, steady(scene, FINE_US))
+    if not np.array_equal(expected.t_us, found.t_us):
+        raise DetectorError(f"{scene.name}: {_SAID}")
+    for level in levels:
+        other = (expected.value > level) != (found.value > level)
+        near = np.abs(np.array([expected.value[other], found.value[other]]) - level)
+        if (near.max(axis=0, initial=0.0) > TOLERANCE * max(abs(level), TOLERANCE)).any():
+            raise DetectorError(f"{scene.name}: {_SAID}")
+    return found
 
 
-def _same(one: Evidence, other: Evidence) -> bool:
-    """Return whether two answers to the same events agree."""
-    if not np.array_equal(one.t_us, other.t_us):
-        return False
-    finite = np.isfinite(one.value)
-    if not np.array_equal(finite, np.isfinite(other.value)):
-        return False
-    scale = np.abs(one.value[finite]).max(initial=0.0)
-    return np.allclose(one.value[finite], other.value[finite], TOLERANCE, TOLERANCE * scale)
+_SAID = (
+    f"evidence is other in chunks of {FINE_US // 1000} ms than in longer ones; it must depend on "
+    "earlier events alone"
+)

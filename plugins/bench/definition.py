@@ -1,4 +1,4 @@
-"""Scenes of the bench, version 1. Frozen: any change here requires a new version.
+"""Scenes of the bench, version 2. Frozen: any change here requires a new version.
 
 Worlds are simulated rigs around the shipped rig `rehearsal`, their parameters drawn uniformly in
 their logarithms. Those of training and validation have seeds that everybody knows; those of tests
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class ScenePart:
     """Scenes of one part.
 
     Attributes:
-        worlds: simulated rigs. slides: in each of them. holds: scenes with a long hold in all.
+        worlds: simulated rigs. slides: in each of them.
+        holds: scenes with a long hold, each in a world of its own.
     """
 
     worlds: int
@@ -39,7 +40,7 @@ class Size:
     """A set of scenes.
 
     Attributes:
-        nuisance: scenes of each nuisance, in as many worlds.
+        nuisance: scenes of each nuisance, each in a world of its own.
     """
 
     train: ScenePart
@@ -76,6 +77,6 @@ class Definition:
 
 DEFINITION = Definition()
 SIZES = {
-    "full": Size(ScenePart(16, 9, 0), ScenePart(12, 8, 30), ScenePart(16, 12, 30), 4),
+    "full": Size(ScenePart(16, 9, 0), ScenePart(12, 8, 120), ScenePart(16, 12, 30), 4),
     "small": Size(ScenePart(4, 4, 0), ScenePart(4, 4, 2), ScenePart(6, 4, 2), 1),
 }

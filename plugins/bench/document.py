@@ -41,13 +41,16 @@ class BenchPoint(Part):
     """A detector on test scenes at one asked rate of false alarms.
 
     Attributes:
-        asked: false alarms an hour. allowed: in all validation scenes.
+        asked: false alarms an hour. allowed: in all validation scenes, at the most.
         level: lowest at which these have no more; None where nothing bounds it.
+        promised: the upper end of the validation scenes' rate is at most `asked`; None in older
+            results. If not, their hours were too few.
     """
 
     asked: Number
     allowed: Int
     level: Number | None
+    promised: Bool | None = None
     test: BenchScores
 
 

@@ -1,25 +1,25 @@
 """Figures of a detector in the bench, and the order of the table.
 
-Levels are set on validation scenes alone, by `validated`; `tested` applies them to test scenes.
+Levels are set on validation scenes alone (`alarms.promised_levels`); `tested` applies them to test
+scenes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from sliplab.analysis.detectors.detector import NO_LABEL
-from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.metrics.intervals import median_interval
 from sliplab.plugins.bench.alarms import (
+    Level,
     SceneAlarms,
     SceneEvidence,
-    hours_without_slip,
-    level_at,
+    false_alarm_rate,
     outcome,
+    worlds_of,
 )
 from sliplab.plugins.bench.document import (
     BenchDetector,
@@ -33,29 +33,6 @@ RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Asked false alarms an hour; the first one is the table's."""
 
 
-@dataclass(frozen=True)
-class Level:
-    """A level of evidence, set on validation scenes.
-
-    Attributes:
-        asked: false alarms an hour. allowed: in all validation scenes.
-    """
-
-    asked: float
-    allowed: int
-    value: float
-
-
-def validated(scenes: Sequence[SceneEvidence], rates: Sequence[float] = RATES) -> list[Level]:
-    """Return the lowest level of each rate at which validation scenes keep it."""
-    hours = hours_without_slip(scenes)
-    found = []
-    for rate in rates:
-        allowed = int(np.floor(rate * hours + 1e-9))
-        found.append(Level(rate, allowed, level_at(scenes, allowed)))
-    return found
-
-
 def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[BenchPoint, ...]:
     """Return the scores of test scenes at levels that are set already."""
     return tuple(
@@ -63,6 +40,7 @@ def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[Be
             asked=level.asked,
             allowed=level.allowed,
             level=float(level.value) if np.isfinite(level.value) else None,
+            promised=level.promised,
             test=scores(scenes, level.value),
         )
         for level in levels
@@ -72,7 +50,7 @@ def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[Be
 def scores(scenes: Sequence[SceneEvidence], level: float) -> BenchScores:
     """Return the scores of scenes at a level."""
     outcomes = [outcome(scene, level) for scene in scenes]
-    worlds = _worlds(scenes)
+    worlds = worlds_of(scenes)
     return BenchScores(
         slides=len(outcomes),
         worlds=len(set(worlds)),
@@ -80,13 +58,8 @@ def scores(scenes: Sequence[SceneEvidence], level: float) -> BenchScores:
         latency_paper_ms=_median(outcomes, [it.slip.paper_us for it in outcomes], worlds),
         missed=sum(it.detected_us is None for it in outcomes),
         early=sum(it.early for it in outcomes),
-        false_alarms=_alarm_rate(scenes, outcomes),
+        false_alarms=false_alarm_rate(scenes, level),
     )
-
-
-def _worlds(scenes: Sequence[SceneEvidence]) -> list[str]:
-    """Return the world of each scene; one that shares none has its place as a name."""
-    return [scene.world or f"scene {place}" for place, scene in enumerate(scenes)]
 
 
 def _median(
@@ -105,14 +78,6 @@ def _median(
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
-
-
-def _alarm_rate(scenes: Sequence[SceneEvidence], outcomes: Sequence[SceneAlarms]) -> AlarmRate:
-    """Return the rate of false alarms with its interval over worlds."""
-    _, world = np.unique(_worlds(scenes), return_inverse=True)
-    counts = np.bincount(world, [found.false for found in outcomes])
-    times = np.bincount(world, [hours_without_slip([scene]) for scene in scenes])
-    return alarm_rate(counts, times)
 
 
 def accuracy(scenes: Sequence[SceneEvidence], length_us: int = 30_000) -> float | None:
@@ -168,4 +133,4 @@ def nuisance_scores(
 def disturbed_rate(scenes: Mapping[str, Sequence[SceneEvidence]], level: float) -> AlarmRate | None:
     """Return false alarms in all scenes with nuisances at a level; None without such scenes."""
     every = [scene for found in scenes.values() for scene in found]
-    return _alarm_rate(every, [outcome(scene, level) for scene in every]) if every else None
+    return false_alarm_rate(every, level) if every else None

@@ -1,48 +1,64 @@
 """`sliplab bench`: detectors on the scenes of the bench.
 
-All choices are made by `prepare`, which has no test scene. A detector's evidence is stored as soon
-as it is complete, so that a stopped run resumes with the next detector.
+Each detector runs in a process of its own, which is given events chunk by chunk. All choices are
+made by `prepare`, which has no test scene. A detector's figures are stored as soon as they are
+complete, so that a stopped run resumes with the next detector.
 """
 
 from __future__ import annotations
 
 import ctypes
+import json
+import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from multiprocessing import active_children
 from pathlib import Path
+
+import numpy as np
 
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.registry import contents, make_detector
 from sliplab.flows.running import console, stopping
 from sliplab.plugins.bench import scenes
-from sliplab.plugins.bench.alarms import SceneEvidence, hours_without_slip
-from sliplab.plugins.bench.audit import audit
+from sliplab.plugins.bench.alarms import (
+    Level,
+    SceneEvidence,
+    hours_without_slip,
+    promised_levels,
+)
+from sliplab.plugins.bench.apart import ApartDetector
+from sliplab.plugins.bench.audit import audit, drawn_edges
 from sliplab.plugins.bench.definition import SIZES, VERSION, Size
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, KeptDetector
 from sliplab.plugins.bench.figures import (
-    Level,
+    RATES,
     accuracy,
     disturbed_rate,
     nuisance_scores,
     ranked,
     tested,
-    validated,
 )
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.plugins.bench.scenes import SceneDraw
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_integer
+from sliplab.storage.files import make_folder, read_json, write_text
 from sliplab.storage.process import out_of_reach
 from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.trials.derived import Derived, make_key
 
-ENTRIES_VERSION = 2
+ENTRIES_VERSION = 3
 """Incremented when a shipped detector has other figures or intervals on the same scenes."""
+AUDITED = 24
+"""Slides of the test in which causality is checked."""
+LONG_US = 60_000_000
+"""Scenes with a long hold are left out there: they would take most of the time."""
+SEED_FILE = "seed.json"
 Advance = Callable[[], None]
 
 
@@ -66,12 +82,12 @@ class Tests:
 class Prepared:
     """A trained detector with the levels of its evidence, chosen without test scenes."""
 
-    detector: Detector
+    detector: ApartDetector
     levels: list[Level]
     train_s: float
 
 
-def prepare(detector: Detector, training: TrainingScenes, advance: Advance) -> Prepared:
+def prepare(detector: ApartDetector, training: TrainingScenes, advance: Advance) -> Prepared:
     """Train a detector, and set its levels on validation scenes.
 
     Args:
@@ -82,25 +98,45 @@ def prepare(detector: Detector, training: TrainingScenes, advance: Advance) -> P
     train_s = time.perf_counter() - start
     advance()
     found = judged(detector, training.validation, advance)
-    return Prepared(detector, validated(found), train_s)
+    return Prepared(detector, promised_levels(found, RATES), train_s)
 
 
-def judged(detector: Detector, given: Sequence[Scene], advance: Advance) -> list[SceneEvidence]:
-    """Return a detector's evidence on scenes."""
+def judged(
+    detector: Detector, given: Sequence[Scene], advance: Advance, seed: int | None = None
+) -> list[SceneEvidence]:
+    """Return a detector's evidence on scenes.
+
+    Args:
+        seed: draws the chunks in which events are given; without one each has a second.
+    """
     found = []
-    for scene in given:
-        found.append(SceneEvidence(feed(detector, scene), scene.slip, scene.world))
+    for place, scene in enumerate(given):
+        edges = None if seed is None else drawn_edges(scene, hash_integer("chunks", seed, place))
+        found.append(SceneEvidence(feed(detector, scene, edges), scene.slip, scene.world))
         advance()
     return found
 
 
-def measure(name: str, prepared: Prepared, tests: Tests, advance: Advance) -> BenchDetector:
-    """Return the figures of a detector on test scenes."""
+def measure(
+    name: str, prepared: Prepared, tests: Tests, seed: int, advance: Advance
+) -> BenchDetector:
+    """Return the figures of a detector on test scenes.
+
+    Raises:
+        DetectorError: its evidence is invalid, or rests on later events.
+    """
     detector, levels = prepared.detector, prepared.levels
-    found = judged(detector, tests.scenes, advance)
+    found = judged(detector, tests.scenes, advance, seed)
     disturbed = {
-        nuisance: judged(detector, given, advance) for nuisance, given in tests.nuisances.items()
+        nuisance: judged(detector, given, advance, hash_integer(nuisance, seed))
+        for nuisance, given in tests.nuisances.items()
     }
+    slides = [place for place, scene in enumerate(tests.scenes) if scene.end_us < LONG_US]
+    chosen = np.random.default_rng(seed).permutation(slides)[:AUDITED]
+    detector.decisions_us.clear()
+    for place in chosen.tolist():
+        expected = found[place].evidence
+        audit(detector, tests.scenes[place], expected, [level.value for level in levels])
     cost = detector.cost()
     return BenchDetector(
         name=name,
@@ -110,7 +146,7 @@ def measure(name: str, prepared: Prepared, tests: Tests, advance: Advance) -> Be
         accuracy=accuracy(found),
         operations=cost.operations,
         memory_bytes=cost.memory_bytes,
-        decision_us=audit(detector, tests.scenes[0]).decision_us,
+        decision_us=float(np.median(detector.decisions_us or [0.0])),
         train_s=prepared.train_s,
     )
 
@@ -207,25 +243,23 @@ def _bench(size: Size, seed: int) -> BenchScenes:
 
 
 def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
-    """Evaluate a detector, in one thread of this process.
+    """Evaluate a detector, in a process beside this one.
 
     Raises:
         InputError: it breaks the rules of the bench.
     """
-    with suppress(ModuleNotFoundError):  # of an extra that a detector may do without
-        from sliplab.analysis.networks.training import limit_threads
-
-        limit_threads(1)  # torch's threads wait for each other busily
     bench = _bench(job.size, job.seed)
     bench.advance = advance or (lambda: None)
-    detector = make_detector(job.name)
+    detector = None
     try:
+        detector = ApartDetector(job.name)
         prepared = prepare(detector, bench.training, bench.advance)
-        row = measure(job.name, prepared, bench.tests, bench.advance)
+        row = measure(job.name, prepared, bench.tests, job.seed, bench.advance)
     except DetectorError as error:
         raise InputError("DETECTOR", "", job.name, str(error)) from None
     finally:
-        detector.close()
+        if detector is not None:
+            detector.close()
     return KeptDetector(row=row, hours=bench.hours)
 
 
@@ -261,14 +295,30 @@ def _judge_each(
             raise
 
 
+def _drawn_seed(folder: Path) -> int:
+    """Return the seed of a folder's test worlds, which is drawn once.
+
+    Raises:
+        InputError: the file of the seed does not have one.
+    """
+    path = folder / SEED_FILE
+    if not path.exists():
+        make_folder(folder)
+        write_text(path, json.dumps({"seed": secrets.randbelow(2**31)}) + "\n")
+    found = read_json(path).get("seed")
+    if not isinstance(found, int):
+        raise InputError(str(path), "seed", found, "must be a whole number")
+    return found
+
+
 def run_bench(
-    names: Sequence[str], size: str, seed: int, folder: Path, workers: int = 1
+    names: Sequence[str], size: str, seed: int | None, folder: Path, workers: int = 1
 ) -> BenchResult:
     """Evaluate detectors without a result; return the table of all that are named.
 
     Args:
         names: of detectors, see `registry`. size: one of `SIZES`.
-        seed: of the test worlds.
+        seed: of the test worlds; None: that of the folder, and drawn where it has none.
         folder: keeps what a detector gave.
         workers: processes at the most; each simulates the scenes for itself.
 
@@ -284,6 +334,8 @@ def run_bench(
     for name in names:
         make_detector(name).close()  # wrong input fails before anything is simulated
     saved = Derived(folder / "detectors")
+    if seed is None:
+        seed = _drawn_seed(folder)
     keys = {
         name: make_key("bench", VERSION, [name, contents(name)], [ENTRIES_VERSION, size, seed])
         for name in names

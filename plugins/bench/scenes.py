@@ -64,19 +64,19 @@ def test_scenes(size: Size, seed: int) -> list[SceneDraw]:
 
 
 def nuisance_scenes(size: Size, seed: int) -> dict[str, list[SceneDraw]]:
-    """Return scenes with each nuisance, in worlds that a seed draws; the same in each."""
+    """Return scenes with each nuisance, in worlds that a seed draws."""
     drawn_by = hash_integer("bench nuisances", VERSION, seed)
     found: dict[str, list[SceneDraw]] = {}
-    for name in NUISANCES:
+    for place, name in enumerate(NUISANCES):
         found[name] = []
         for number in range(size.nuisance):
-            rng = np.random.default_rng([drawn_by, number])
+            rng = np.random.default_rng([drawn_by, place, number])
             hold_s = _value(DEFINITION.nuisance_hold_s, rng)
             chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
-            rig = _world(drawn_by, number)
+            rig = _world(drawn_by, place * size.nuisance + number)
             faults = nuisance_faults(name, hold_s, scene_of(rig), chance)
-            world = f"nuisances {number + 1}"
-            found[name].append(_drawn(f"{name} {number + 1}", world, rig, hold_s, rng, faults))
+            world = f"{name} {number + 1}"
+            found[name].append(_drawn(world, world, rig, hold_s, rng, faults))
     return found
 
 
@@ -89,11 +89,10 @@ def _part(name: str, part: ScenePart, seed: int) -> Iterator[SceneDraw]:
             world = f"{name} {number + 1}"
             yield _drawn(f"{world}.{slide + 1}", world, rig, hold_s, rng)
     for hold in range(part.holds):
-        rng = np.random.default_rng([seed, hold])
+        rng = np.random.default_rng([seed, hold, hash_integer("hold")])
         hold_s = _value(DEFINITION.long_hold_s, rng)
-        number = hold % part.worlds
-        world = f"{name} {number + 1}"
-        yield _drawn(f"{name} hold {hold + 1}", world, worlds[number], hold_s, rng)
+        world = f"{name} hold {hold + 1}"
+        yield _drawn(world, world, _world(seed, part.worlds + hold), hold_s, rng)
 
 
 def _world(seed: int, number: int) -> RigFile:

@@ -47,8 +47,11 @@ def measure(
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, max=2**31, help="Draws the test worlds.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            "--seed", min=0, max=2**31, help="Of the test worlds; default: drawn, and printed."
+        ),
+    ] = None,
     small: Annotated[bool, typer.Option("--small", help="Fewer scenes, for a first look.")] = False,
     folder: Annotated[
         Path, typer.Option("--folder", help="Keeps the results, so that a run resumes.")

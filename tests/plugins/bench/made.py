@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Sequence
+
 import numpy as np
 
-from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
+from sliplab.analysis.detectors.detector import Cost, Detector, Evidence, Scene, Slip
 from sliplab.analysis.detectors.feeding import feed
-from sliplab.plugins.bench.alarms import SceneEvidence
+from sliplab.analysis.detectors.registry import make_detector
+from sliplab.plugins.bench.alarms import SceneEvidence, promised_levels
 from sliplab.plugins.bench.document import BenchDetector
-from sliplab.plugins.bench.figures import RATES, tested, validated
+from sliplab.plugins.bench.figures import RATES, tested
+from sliplab.plugins.bench.run import BenchScenes
 from sliplab.storage.streams import EventChunk
 
 SLIP_HZ = 2000
@@ -52,6 +57,26 @@ class Counting(Detector):
         return Evidence.of(ends, count)
 
 
+class InThisProcess(Detector):
+    """A detector as the bench runs it, without a process of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.decisions_us: list[float] = []
+        self.detector = make_detector(name)
+
+    def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
+        self.detector.train(scenes, validation)
+
+    def begin(self, width: int, height: int) -> None:
+        self.detector.begin(width, height)
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        return self.detector.push(events, until_us)
+
+    def cost(self) -> Cost:
+        return self.detector.cost()
+
+
 def row_of(
     name: str, detector: Detector, train: list[Scene], validation: list[Scene], test: list[Scene]
 ) -> BenchDetector:
@@ -61,7 +86,7 @@ def row_of(
         return [SceneEvidence(feed(detector, one), one.slip, one.world) for one in scenes]
 
     detector.train(train, validation)
-    levels = validated(judged(validation), RATES)
+    levels = promised_levels(judged(validation), RATES)
     return BenchDetector(
         name=name,
         curve=tested(judged(test), levels),
@@ -72,3 +97,21 @@ def row_of(
         decision_us=0.0,
         train_s=0.0,
     )
+
+
+class Broken(Detector):
+    """Answers with a number instead of evidence."""
+
+    def begin(self, width: int, height: int) -> None:
+        pass
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        return 3  # type: ignore[return-value]
+
+
+class Snoops(Counting):
+    """Looks for scenes and the test's seed in all objects of its process."""
+
+    def cost(self) -> Cost:
+        found = [one for one in gc.get_objects() if isinstance(one, Scene | BenchScenes)]
+        return Cost(operations=len(found))

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.detectors.detector import Evidence, Slip
-from sliplab.plugins.bench.alarms import SceneEvidence, alarm_times, level_at, outcome
+from sliplab.plugins.bench.alarms import (
+    SceneEvidence,
+    alarm_times,
+    level_at,
+    outcome,
+    promised_levels,
+)
 from sliplab.plugins.bench.figures import accuracy, disturbed_rate, scores
 
 SLIP = Slip(5_000_000, 5_100_000, 8_000_000)
@@ -116,3 +122,42 @@ def test_accuracy_weighs_classes_and_not_windows() -> None:
     never = SceneEvidence(Evidence.of(t_us, values, np.zeros(len(t_us))), SLIP)
     assert accuracy([never]) == pytest.approx(1 / 3)
     assert accuracy([SceneEvidence(Evidence.of(t_us, values), SLIP)]) is None
+
+
+def worlds_with_alarms(
+    rng: np.random.Generator, worlds: int, hours: float, shape: float
+) -> list[SceneEvidence]:
+    """Draw worlds whose rates above a level u are gamma times exp(-u), 300 an hour in mean."""
+    found = []
+    slip_us = round(3.6e9 * hours / worlds)
+    for world in range(worlds):
+        rate = 300 * rng.gamma(shape) / shape
+        t_us = np.unique(rng.integers(0, slip_us, rng.poisson(rate * hours / worlds)))
+        evidence = Evidence.of(t_us, rng.exponential(size=len(t_us)))
+        found.append(SceneEvidence(evidence, Slip(slip_us, slip_us, slip_us), str(world)))
+    return found
+
+
+@pytest.mark.parametrize("shape", [100.0, 1.0])
+@pytest.mark.parametrize("draws", [20, pytest.param(400, marks=pytest.mark.long)])
+def test_a_promise_is_kept_in_new_worlds(draws: int, shape: float) -> None:
+    rates = (1.0, 10.0, 30.0)
+    rng = np.random.default_rng(7)
+    broken = np.zeros(len(rates))
+    for _ in range(draws):
+        levels = promised_levels(worlds_with_alarms(rng, 130, 4.3, shape), rates)
+        assert all(level.promised for level in levels)
+        assert np.all(np.diff([level.value for level in levels]) <= 0)
+        broken += [300 * np.exp(-level.value) > level.asked for level in levels]
+    # 5 % of the draws, and three standard deviations of so many draws
+    assert (broken <= 0.05 * draws + 3 * np.sqrt(0.05 * draws)).all()
+
+
+def test_a_rate_that_the_hours_cannot_show_is_not_promised() -> None:
+    rng = np.random.default_rng(1)
+    one, more = promised_levels(worlds_with_alarms(rng, 30, 0.5, 1.0), (1.0, 30.0))
+    assert not one.promised, "half an hour without an alarm allows 7 an hour"
+    assert one.allowed == 0
+    assert more.promised
+    assert more.allowed > 0
+    assert more.value < one.value

@@ -7,7 +7,7 @@ import pytest
 
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
 from sliplab.analysis.detectors.feeding import feed
-from sliplab.plugins.bench.audit import audit
+from sliplab.plugins.bench.audit import COARSE_US, audit, drawn_edges
 from sliplab.storage.streams import EventChunk
 from tests.plugins.bench.made import Counting, scene
 
@@ -50,17 +50,60 @@ def test_evidence_that_is_none_is_refused(detector: Detector, said: str, one: Sc
         feed(detector, one)
 
 
-def test_evidence_depends_on_earlier_events_alone(one: Scene) -> None:
-    class LooksAhead(Counting):
-        """Its evidence is how many events the whole chunk has."""
+LEVEL = 15.0
+
+
+class LooksAhead(Counting):
+    """Counts the events of the next 100 ms, where it has been given them."""
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        found = super().push(events, until_us)
+        later = np.searchsorted(events.t_us, found.t_us + 100_000)
+        return Evidence.of(found.t_us, later - np.searchsorted(events.t_us, found.t_us))
+
+
+class HidesIt(LooksAhead):
+    """Says one huge number before, so that differences look small beside it."""
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        found = super().push(events, until_us)
+        return Evidence.of(found.t_us, np.where(found.t_us < 500_000, -1e9, found.value))
+
+
+@pytest.mark.parametrize("detector", [LooksAhead(), HidesIt()])
+def test_a_detector_that_looks_ahead_is_refused(detector: Detector, one: Scene) -> None:
+    found = feed(detector, one, drawn_edges(one, 1))
+    with pytest.raises(DetectorError, match="must depend on earlier events alone"):
+        audit(detector, one, found, [LEVEL])
+
+
+def test_a_detector_that_does_not_is_accepted(one: Scene) -> None:
+    found = feed(Counting(), one, drawn_edges(one, 1))
+    fine = audit(Counting(), one, found, [-np.inf, LEVEL])
+    assert np.array_equal(fine.value, found.value)
+    assert (found.value > LEVEL).any()
+
+
+def test_rounding_is_no_look_ahead(one: Scene) -> None:
+    class Rounded(Counting):
+        """Its numbers depend on the size of chunks, as sums in another order do."""
 
         def push(self, events: EventChunk, until_us: int) -> Evidence:
             found = super().push(events, until_us)
-            return Evidence.of(found.t_us, np.full(len(found), len(events)))
+            return Evidence.of(found.t_us, found.value * (1 + 1e-6 * len(events)))
 
-    assert len(audit(Counting(), one).evidence) == one.end_us // 10_000
-    with pytest.raises(DetectorError, match="must depend on earlier events alone"):
-        audit(LooksAhead(), one)
+    found = feed(Rounded(), one, drawn_edges(one, 1))
+    audit(Rounded(), one, found, [LEVEL])
+
+
+def test_chunks_of_tests_are_drawn_anew_and_cover_the_scene(one: Scene) -> None:
+    edges = drawn_edges(one, 1)
+    assert edges == drawn_edges(one, 1)
+    assert edges != drawn_edges(one, 2)
+    lengths = np.diff([0, *edges])
+    assert lengths[:-1].min() >= COARSE_US[0]
+    assert 0 < lengths[-1] <= lengths.max() <= COARSE_US[1]
+    assert edges[-1] == one.end_us
 
 
 def test_all_events_are_given_once_and_in_time(one: Scene) -> None:

@@ -10,12 +10,14 @@ import pytest
 
 from sliplab.analysis.detectors.detector import Scene
 from sliplab.plugins.bench import run, scenes
+from sliplab.plugins.bench.apart import ApartDetector
 from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
 from sliplab.plugins.bench.document import BenchResult
 from sliplab.plugins.bench.entries.thresholds import EventRate
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
 from tests.command_line import here
+from tests.plugins.bench.made import InThisProcess
 
 TINY = Size(ScenePart(1, 2, 0), ScenePart(1, 3, 0), ScenePart(2, 2, 0), 1)
 NAMES = ("rate", "always", "random")
@@ -36,10 +38,17 @@ def simulated() -> Callable[[scenes.SceneDraw], Scene]:
     return once
 
 
+@pytest.fixture
+def apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run detectors in processes of their own, as the bench does."""
+    monkeypatch.setattr(run, "ApartDetector", ApartDetector)
+
+
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch, simulated: Callable[[scenes.SceneDraw], Scene]) -> None:
     monkeypatch.setitem(SIZES, "small", TINY)
     monkeypatch.setattr(scenes, "simulated", simulated)
+    monkeypatch.setattr(run, "ApartDetector", InThisProcess)
     run._bench.cache_clear()
 
 
@@ -73,7 +82,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
     simulated: Callable[[scenes.SceneDraw], Scene],
 ) -> None:
     done: list[str] = []
-    validated = run.validated
+    promised_levels = run.promised_levels
 
     def simulate(drawn: scenes.SceneDraw) -> Scene:
         done.append(drawn.name.split()[0])
@@ -81,10 +90,10 @@ def test_choices_are_made_before_a_test_scene_is_there(
 
     def choose(*args: object) -> object:
         done.append("chosen")
-        return validated(*args)  # type: ignore[arg-type]
+        return promised_levels(*args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(scenes, "simulated", simulate)
-    monkeypatch.setattr(run, "validated", choose)
+    monkeypatch.setattr(run, "promised_levels", choose)
     run.run_bench(["rate"], "small", 1, tmp_path)
     assert done[: done.index("chosen")] == ["train"] * 2 + ["validation"] * 3
     assert set(done[done.index("chosen") + 1 :]) == {"test", *NUISANCES}
@@ -119,8 +128,8 @@ def test_a_stopped_run_resumes_with_the_next_detector(
     trained: list[str] = []
     prepare = run.prepare
 
-    def prepared(detector: object, *rest: object) -> object:
-        trained.append(type(detector).__name__)
+    def prepared(detector: InThisProcess, *rest: object) -> object:
+        trained.append(type(detector.detector).__name__)
         return prepare(detector, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "prepare", prepared)
@@ -130,6 +139,7 @@ def test_a_stopped_run_resumes_with_the_next_detector(
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("apart")
 def test_processes_give_the_figures_of_one(folder: Path, tmp_path: Path) -> None:
     one = run.run_bench(NAMES, "small", 1, folder)
     several = run.run_bench(NAMES, "small", 1, tmp_path, workers=2)
@@ -141,7 +151,8 @@ def test_processes_give_the_figures_of_one(folder: Path, tmp_path: Path) -> None
 
 
 def test_the_command_prints_what_it_writes(folder: Path) -> None:
-    done = here("bench", *NAMES, "--small", "--folder", folder, "--json")
+    words = ("bench", *NAMES, "--small", "--seed", 5, "--folder", folder)
+    done = here(*words, "--json")
     assert done.returncode == 0, done.stderr
     data = json.loads(done.stdout)
     assert data.pop("page") == str(folder / "bench.html")
@@ -152,8 +163,8 @@ def test_the_command_prints_what_it_writes(folder: Path) -> None:
     assert all(
         text in page for text in ("simulated", "over 2 test worlds", "<svg", "decision (us)")
     )
-    shown = here("bench", *NAMES, "--small", "--folder", folder)
-    assert "bench 1, small, seed 1 (simulated)" in shown.stdout
+    shown = here(*words)
+    assert "bench 2, small, seed 5 (simulated)" in shown.stdout
     said = " ".join(shown.stderr.split())
     assert "over 2 test worlds and 1 with nuisances; below 24 trials or worlds, here 1" in said
     for row in data["detectors"]:
@@ -200,9 +211,25 @@ def test_wrong_input_is_said_before_anything_is_simulated(
     assert not (tmp_path / "f").exists()
 
 
-def test_a_detector_that_breaks_the_rules_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(EventRate, "push", lambda *_: 3)
-    with pytest.raises(InputError, match=r"DETECTOR = rate: .*: push returned int"):
-        run.run_bench(["rate"], "small", 1, tmp_path)
+@pytest.mark.usefixtures("apart")
+def test_a_detector_that_breaks_the_rules_is_named(tmp_path: Path) -> None:
+    name = "tests.plugins.bench.made:Broken"
+    with pytest.raises(InputError, match=rf"DETECTOR = {name}: .*: push returned int"):
+        run.run_bench([name], "small", 1, tmp_path)
+
+
+@pytest.mark.usefixtures("apart")
+def test_a_detector_has_nothing_but_what_it_was_given(tmp_path: Path) -> None:
+    name = "tests.plugins.bench.made:Snoops"
+    row = run.run_bench([name], "small", 1, tmp_path).detectors[0]
+    assert row.operations == 0, "no scene after its training, and no seed"
+    assert row.decision_us > 0
+
+
+def test_a_seed_is_drawn_once_for_a_folder(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    seeds = [run.run_bench(["always"], "small", None, at).seed for at in (one, one, two)]
+    assert seeds[0] == seeds[1] != seeds[2]
+    (one / run.SEED_FILE).write_text('{"seed": "x"}')
+    with pytest.raises(InputError, match="must be a whole number"):
+        run.run_bench(["always"], "small", None, one)
