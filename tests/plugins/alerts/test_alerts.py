@@ -122,7 +122,7 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     done = state(campaigns=[replace(RUNNING, missing=0, planned=4, nights_of_disk=None)])
     texts = {item.kind: item.text for item in [*found(store, at), *found(store, done)]}
     assert set(texts) == set(KINDS)
-    assert texts["run failed"] == "nightly failed: the arm did not answer"
+    assert texts["run failed"] == "collect of nightly failed: the arm did not answer"
     assert "pause by anna" in texts["paused"]
     assert "event_rate at the reference trial r2: -17.0 %" in texts["drift"]
     assert "no trial for 120 min" in texts["idle"]
@@ -230,7 +230,7 @@ def test_a_run_that_was_killed_is_told_once(tmp_path: Path) -> None:
     watching.look(NOW + timedelta(seconds=3))
     run_records.end(store.folder, run, "CRASHED", "its process was killed", "next start")
     watching.look(NOW + timedelta(seconds=6))
-    assert receiver.taken == ["nightly: its process is gone"]
+    assert receiver.taken == ["collect of nightly: its process is gone"]
 
 
 def test_a_grade_that_fell_between_two_looks_is_told(tmp_path: Path) -> None:
