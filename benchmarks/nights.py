@@ -40,7 +40,7 @@ from sliplab.storage.trials.store import Store
 
 SAMPLE_S = 30.0
 LIMIT_S = 180.0
-LEAD_S = 45.0
+LEAD_S = 120.0
 """Time in which the service starts before its first window, s."""
 LATE_S = 30.0
 """Longest a run may take to end after its window, s."""

@@ -27,8 +27,8 @@ STREAM = "/live"
 
 
 def routes(root: Path) -> dict[str, set[str]]:
-    """The methods of every path, with the trial of `store` in place of names."""
-    found: dict[str, set[str]] = {}
+    """The methods of every path, with the trial of `store` in place of names; and of no path."""
+    found: dict[str, set[str]] = {"/nowhere": set()}
     for route in application(Web(Store.create(root), ACCESS)).routes:
         if isinstance(route, Mount):
             found.setdefault(f"{route.path}/style.css", set()).add("GET")
@@ -62,11 +62,11 @@ def browser(store: Store, role: Role | None) -> TestClient:
 
 
 def contents(store: Store) -> dict[str, str]:
-    """A digest of every file of a store."""
+    """A digest of every file of a store but the catalogue, which is made of the others."""
     return {
         str(path.relative_to(store.folder)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(store.folder.rglob("*"))
-        if path.is_file()
+        if path.is_file() and path.parent.name != "catalogue"
     }
 
 
