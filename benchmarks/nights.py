@@ -3,10 +3,10 @@
     python -m benchmarks.nights FOLDER [--minutes 120] [--open 8] [--closed 2] [--browser]
 
 `sliplab serve` takes trials on `rehearsal` at full speed, in windows that a schedule opens and
-closes, with three viewers of the live page and alerts to a server of this program. Meanwhile a person
-writes notes, pauses and resumes; one trial a window loses frames, and one run fails. Every 30 s
-FOLDER/samples.csv gets the memory, open files, sockets, threads and processor time of each program.
-At the end every alert, every line of the log and every trial is accounted for.
+closes, with three viewers of the live page and alerts to a server of this program. Meanwhile a
+person writes notes, pauses and resumes; one trial a window loses frames, and one run fails. Every
+30 s FOLDER/samples.csv gets the memory, open files, sockets, threads and processor time of each
+program. At the end every alert, every line of the log and every trial is accounted for.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def wait_for(found: Any, limit_s: float = LIMIT_S) -> Any:
 
 
 def sample(root: int, began: float) -> Iterator[list[Any]]:
-    """Yield a row of `COLUMNS` of each program below a process; short-lived helpers are left out."""
+    """Yield a row of `COLUMNS` of each program below a process; of `PROGRAMS` only."""
     for pid in descendants(root):
         try:
             yield [round(time.time() - began, 1), *_of_process(pid)]
