@@ -71,7 +71,7 @@ def watch(link: str) -> None:
 
 
 @contextmanager
-def _watched(link: str) -> Iterator[Callable[[], int]]:
+def watching(link: str) -> Iterator[Callable[[], int]]:
     """Watch the page in a process of its own; yield what counts the pictures."""
     command = [sys.executable, "-c", f"from benchmarks.page import watch; watch({link!r})"]
     child = Child(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT)
@@ -113,7 +113,7 @@ def measure(runs: int = RUNS, seconds: float = 20.0) -> Figures:
         work.take(2)  # compiled
         for _ in range(runs):
             alone, _ = _pace(work, seconds)
-            with _watched(link) as pictures:
+            with watching(link) as pictures:
                 pictures()  # they are there
                 # the page has read the store, and the collection has seen that it is watched
                 _pace(work, min(seconds, 5.0))

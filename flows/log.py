@@ -93,7 +93,7 @@ def add_note(
     signed = signature(who, "")
     entry: Json = {**signed, "text": text}
     if context:
-        check_values(context)
+        check_values(context, "--context")
         found = _begun(store, campaigns)
         made = dict(context)
         for campaign in found:

@@ -90,6 +90,8 @@ def days(since: str | None, until: str | None, now: datetime) -> tuple[datetime,
     if since is None:
         raise InputError("--since", "", None, "is required with --until")
     if found["--until"] < found["--since"]:
+        if until is None:
+            raise InputError("--since", "", since, "is in the future")
         raise InputError("--until", "", until, f"is before --since {since}")
     return _midnight(found["--since"]), _midnight(found["--until"] + timedelta(days=1))
 

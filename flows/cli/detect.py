@@ -12,6 +12,7 @@ from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.planning.parameters import RuleOptions
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 
 if TYPE_CHECKING:
     from sliplab.flows.detect import DetectSummary
@@ -143,7 +144,7 @@ def _chosen(
 
         open_store(store)
         prepare_store(store)  # before anything imports Prefect
-    from sliplab.analysis.detectors.registry import is_known
+    from sliplab.analysis.detectors.registry import is_known, known
     from sliplab.flows.store_detectors import Chosen, detectors_of
 
     if detector == "network" and model is None:
@@ -151,7 +152,7 @@ def _chosen(
         raise InputError("--model", "", None, right)
     if store is None and not is_known(detector):
         if detector != "network":
-            right = "is a detector of a store: name the store with --model"
+            right = f"{one_of(detector, known())}; one of a store needs the store as --model"
             raise InputError("--detector", "", detector, right)
         found = Chosen(model)
     else:

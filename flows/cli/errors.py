@@ -55,11 +55,13 @@ _WITH_TRIALS = {
     "reflex",
 }
 """Commands that take trials or process them, and resume."""
-_WATCHING = {
+_ENDLESS = {
     "status": "interrupted: no longer watching",
     "alerts": "interrupted: no longer watching; what waits is sent when alerts run again",
+    "page": "interrupted: the page is closed; a collection that runs goes on",
+    "detect": "interrupted: no longer detecting",
 }
-"""What is said at the end of commands that only watch."""
+"""What is said at the end of commands that run until they are interrupted."""
 _EXPECTED = {
     "RigError",
     "ArmFault",
@@ -124,7 +126,7 @@ def interruption() -> Failure:
     text = "interrupted: nothing is left half-written; run the same command again"
     if command in _WITH_TRIALS:
         text = _RESUMABLE
-    text = _WATCHING.get(command, text)
+    text = _ENDLESS.get(command, text)
     return Failure(text, exit_codes.INTERRUPTED)
 
 

@@ -28,7 +28,11 @@ def schema(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Write to this file instead; without KIND, all to this folder."),
+        typer.Option(
+            "--out",
+            help="Write to this file instead; without KIND, all to this folder. Missing folders "
+            "are made.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

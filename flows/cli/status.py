@@ -9,6 +9,7 @@ import typer
 from sliplab.flows.cli.common import COLLECT, CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import one_of
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -90,11 +91,17 @@ def log(
     if text is not None or changed:
         _add(opened, text, changed, campaign, who, as_json)
         return
-    for option, value in (("--who", who), ("--campaign", campaign)):
-        if value is not None:
-            raise InputError(option, "", str(value), "needs a note, --skin or --context")
+    if who is not None:
+        raise InputError("--who", "", who, "needs a note, --skin or --context")
+    there = [item.name for item in opened.campaigns()]
+    for name in campaign or ():
+        if name not in there:
+            right = one_of(name, there) if there else "is not there: no campaign has begun"
+            raise InputError("--campaign", "", name, right)
     unreadable: list[str] = []
     entries = log_entries(opened, unreadable)
+    if campaign:
+        entries = [e for e in entries if {*e.campaign.split(", ")} & {*campaign}]
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if as_json:

@@ -1,4 +1,4 @@
-"""The log of the store: who did what, and a note to add."""
+"""The log of the store: who did what, and a note or another skin to add."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from starlette.routing import BaseRoute, Route
 
 from sliplab.flows.log import add_note, log_entries
 from sliplab.flows.web.web import form, named, viewer
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
+from sliplab.storage.trials.context import SKIN
 
 if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
@@ -35,12 +38,12 @@ def routes(web: Web) -> list[BaseRoute]:
         given = await form(request)
         text, name = given.get("text", ""), viewer(request).name
         who = given.get("who", "").strip()[:100] or name
+        skin = given.get("skin", "").strip()
+        context = {SKIN: skin} if skin else None
         try:
-            await asyncio.to_thread(add_note, web.store, text, who=who)
-        except ValueError as error:
-            return web.render(
-                request, "problem.html", 422, title="Log", problem=f"The note {error}."
-            )
+            await asyncio.to_thread(add_note, web.store, text, who=who, context=context)
+        except (InputError, StoreError, OSError) as error:
+            return web.render(request, "problem.html", 422, title="Log", problem=str(error))
         return named(request, RedirectResponse("/log", 303), who)
 
     return [Route("/log", show), Route("/log", note, methods=["POST"])]

@@ -30,7 +30,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import review
-from sliplab.storage.trials.catalogue import catalogue, query
+from sliplab.storage.trials.catalogue import catalogue_so_far, query
 from sliplab.storage.trials.checksums import read_sums, to_fetch
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from sliplab.flows.web.web import Web
 
 PAGE_ROWS = 100
+READ_S = 4.0
+"""Longest time in which a request reads trials for the catalogue, s; the next ones go on."""
 RETAINED = 4
 """Trials whose data stay in memory."""
 FIRST_COLUMNS = ("campaign", "trial", "recorded_s", "events", "frames", "attempt", "passed")
@@ -149,13 +151,16 @@ class Choice:
 def _listing(store: Store, chosen: Choice) -> dict[str, Any]:
     """Return what the catalogue's page shows."""
     unreadable: list[str] = []
-    table = catalogue(store, unreadable)
+    table, left = catalogue_so_far(store, unreadable, READ_S)
     whole = None
-    if len(table) and not unreadable:  # else what is whole may be more than what can be read
+    if left:
+        whole = {c.name: {path.name for path in c.folders("trials")} for c in store.campaigns()}
+    elif len(table) and not unreadable:  # else what is whole may be more than what can be read
         whole = {str(name): set(part) for name, part in table.groupby("campaign")["trial"]}
     excluded = all_excluded(store, unreadable, whole)
     about = {
         "total": len(table),
+        "left": left,
         "campaigns": list(whole or dict.fromkeys(table.get("campaign", ()))),
         "all_columns": list(table.columns),
         "excluded": excluded,
@@ -322,7 +327,7 @@ def _neighbours(
     store: Store, name: tuple[str, str], chosen: Choice
 ) -> tuple[tuple[str, str] | None, tuple[str, str] | None]:
     """Return the trials before and after one in a catalogue's choice."""
-    table = catalogue(store, [])
+    table, _ = catalogue_so_far(store, [], READ_S)
     with suppress(ValueError):
         table = chosen.of_table(table)
     names = list(zip(table["campaign"], table["trial"], strict=True)) if len(table) else []

@@ -81,7 +81,7 @@ def _events(
 
 def _failed_runs(store: Store, now: datetime) -> Iterator[Event]:
     for run, ended in run_records.runs(store.folder):
-        name = run.get("deployment") or run["flow"]
+        name = " of ".join(filter(None, [run["flow"], run.get("deployment")]))
         if ended is None:
             if run_records.was_killed(run):  # the next program that opens the store writes its end
                 yield Event(f"run {run['run']}", "run failed", f"{name}: its process is gone", now)

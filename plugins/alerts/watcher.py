@@ -30,6 +30,8 @@ class AppriseTarget:
 
     def __init__(self, address: str) -> None:
         self._sender: NotifyBase = target(address)
+        # by itself it pauses for 5.5 s; `Outbox` sends one message a look
+        self._sender.request_rate_per_sec = 0.0
         self.name = str(self._sender.url(privacy=True)).partition("?")[0]
 
     def send(self, title: str, text: str) -> bool:

@@ -14,6 +14,7 @@ import ast
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import time
@@ -68,20 +69,38 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     Raises:
         StoreError: a trial is damaged.
     """
+    return catalogue_so_far(store, unreadable, math.inf)[0]
+
+
+def catalogue_so_far(
+    store: Store, unreadable: list[str] | None, within_s: float
+) -> tuple[pd.DataFrame, int]:
+    """Return the catalogue of what can be read in a time, and the number of trials that are left.
+
+    What was read is in the index, so that the next call goes on where this one ended.
+
+    Args:
+        unreadable: as of `catalogue`, which it otherwise is.
+        within_s: no trial but the first is begun later; in a large store, listing it and writing
+            the index take some seconds more.
+    """
     began_ns = time.time_ns()
     found = [(campaign, _Listing.of(campaign)) for campaign in store.campaigns()]
     known = _read_index(store) or _Index(pd.DataFrame())
-    parts, problems = [], []
+    parts, problems, end = [], [], time.monotonic() + within_s
     for campaign, listing in found:
         part = _CampaignRows(campaign, listing, known)
         parts.append(part)
-        problems += part.look(unreadable is None)
+        problems += part.look(unreadable is None, end)
+    names, left = [campaign.name for campaign, _ in found], sum(part.left for part in parts)
+    table, stored = known.table, True
+    if names != list(known.bounds) or any(part.changed for part in parts):
+        table, stored = _rebuilt(store, parts, known, began_ns)
+    if left and not stored:  # the next call would begin anew
+        return catalogue_so_far(store, unreadable, math.inf)
     if unreadable is not None:
         unreadable += problems
-    names = [campaign.name for campaign, _ in found]
-    if names == list(known.bounds) and not any(part.changed for part in parts):
-        return known.table
-    return _rebuilt(store, parts, known, began_ns)
+    return table, left
 
 
 def query(table: pd.DataFrame, expression: str, argument: str = "where") -> pd.DataFrame:
@@ -240,6 +259,7 @@ class _CampaignRows:
         kept: numbers of the index's rows that are still valid, by trial.
         sync: stamp of each trial's refitted clocks, taken before they are read.
         fresh: rows that were read now, by trial.
+        left: number of trials that were not read for want of time.
     """
 
     def __init__(self, campaign: Campaign, listing: _Listing, known: _Index) -> None:
@@ -257,13 +277,17 @@ class _CampaignRows:
         self.sync: dict[str, str] = {}
         if not same_clocks:
             old = known.sync()
-            self.sync = {name: _sync_key(campaign, name) for name in listing.names}
+            self.sync = {name: _sync_key(campaign, name) for name in self.retained}
             self.retained = {n: at for n, at in self.retained.items() if self.sync[n] == old[at]}
         self.fresh: dict[str, Row] = {}
+        self.left = 0
         self.changed = len(self.retained) != high - low or not same_clocks
 
-    def look(self, strict: bool) -> list[str]:
+    def look(self, strict: bool, end: float) -> list[str]:
         """Read the trials that are not in the index; return a line for each that is damaged.
+
+        Args:
+            end: `time.monotonic()` after which none but the first is read.
 
         Raises:
             StoreError: one is, and it is to be `strict`.
@@ -271,6 +295,9 @@ class _CampaignRows:
         damaged, broken = [], []
         for name in self.listing.names:
             if name in self.retained:
+                continue
+            if self.fresh and time.monotonic() > end:
+                self.left += 1
                 continue
             folder = self.campaign.folder / "trials" / name
             if (cause := incomplete(folder)) is not None:
@@ -290,8 +317,12 @@ class _CampaignRows:
 
 def _rebuilt(
     store: Store, parts: list[_CampaignRows], known: _Index, began_ns: int
-) -> pd.DataFrame:
-    """Return the table from the index and the rows that were read, and write it as the index."""
+) -> tuple[pd.DataFrame, bool]:
+    """Return the table from the index and the rows that were read; write it as the index.
+
+    Returns:
+        The table, and whether the index was written.
+    """
     old_rows, old_sync = known.rows(), known.sync()
     rows: list[Row] = []
     sync: list[str] = []
@@ -302,17 +333,17 @@ def _rebuilt(
         for name, key in zip(part.listing.names, part.listing.settled(began_ns), strict=True):
             at = part.retained.get(name)
             if at is None and name not in part.fresh:
-                continue  # damaged
+                continue  # damaged, or not read yet
             rows.append(part.fresh[name] if at is None else old_rows[at])
             sync.append(part.sync[name] if at is None else old_sync[at])
             new.names.append(name)
             keys.append(key)
         new.bounds[part.campaign.name] = (first, len(rows), part.listing.sync)
     table = pd.DataFrame(rows)
-    if rows:
-        new.keys = np.array(keys, np.int64).reshape(-1, 2)
-        _write_index(store, table, rows, sync, new)
-    return table
+    if not rows:
+        return table, False
+    new.keys = np.array(keys, np.int64).reshape(-1, 2)
+    return table, _write_index(store, table, rows, sync, new)
 
 
 Row = dict[str, str | int | float | None]
@@ -467,10 +498,10 @@ def _parse(data: bytes) -> _Index | None:
 
 def _write_index(
     store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Index
-) -> None:
-    """Write the index, where it can be written and reads again as it is."""
+) -> bool:
+    """Write the index, where it can be written and reads again as it is; False elsewhere."""
     if not installed("pyarrow"):
-        return
+        return False
     frame = table.copy()
     frame[_NAME] = known.names
     frame[_ROW] = [json.dumps(each) for each in rows]
@@ -489,11 +520,14 @@ def _write_index(
         or not back.table.equals(table)
         or list(back.table.dtypes) != list(table.dtypes)
     ):
-        return  # something that Parquet cannot keep as it is: it will be read again each time
-    with suppress(OSError):  # a store that is only read from
+        return False  # something that Parquet cannot keep as it is: it is read each time
+    try:
         path = _path(store)
         make_folder(path.parent)
         write_bytes(path, hashlib.sha256(data).digest() + data)
+    except OSError:  # a store that is only read from
+        return False
+    return True
 
 
 def _path(store: Store) -> Path:

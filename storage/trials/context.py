@@ -44,8 +44,11 @@ def log_journal(store: Store) -> Journal:
     return Journal(inside(store.folder / LOG, store.folder))
 
 
-def check_values(context: Mapping[str, str]) -> None:
+def check_values(context: Mapping[str, str], where: str = "context") -> None:
     """Check names and values.
+
+    Args:
+        where: option or file that gave them.
 
     Raises:
         InputError: the first that is wrong, and what would be right.
@@ -53,13 +56,13 @@ def check_values(context: Mapping[str, str]) -> None:
     for name, value in context.items():
         if not _NAME.fullmatch(name) or name in COLUMNS or name == "r":
             text = "its name must be small letters, digits and '_', and no column of every table"
-            raise InputError("context", name, value, text)
+            raise InputError(where, name, value, text)
         if not _VALUE.fullmatch(value):
             text = (
                 "must be a text of letters, digits, '_', '-' and '.', 32 characters at most, or a "
                 'number with its unit, such as "24 degC"'
             )
-            raise InputError("context", name, value, text)
+            raise InputError(where, name, value, text)
 
 
 def planned_names(plan: Plan) -> set[str]:

@@ -15,6 +15,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import control, review
 from sliplab.storage.trials.review import ReviewedOnsets
 from sliplab.storage.trials.store import Store
+from tests.command_line import answer, here
 from tests.storage.trial_files import campaign, commit, fail
 
 
@@ -52,6 +53,17 @@ def test_the_log_holds_what_people_and_programs_did(tmp_path: Path) -> None:
     assert any(text.startswith("collect of nightly: failed after 0 s: no answer") for text in texts)
     times = [entry.when for entry in log_entries(store)]
     assert times == sorted(times)
+
+
+def test_the_command_prints_the_entries_of_a_campaign(tmp_path: Path) -> None:
+    fail(campaign(tmp_path / "s", "tiny"), "b", 1)
+    fail(campaign(tmp_path / "s", "other"), "c", 1)
+    add_note(Store.open(tmp_path / "s"), "lunch", who="anna")
+    found = answer("log", tmp_path / "s", "--campaign", "tiny")["entries"]
+    assert [entry["trials"] for entry in found] == [["b"]]
+    assert len(answer("log", tmp_path / "s")["entries"]) == 3
+    done = here("log", tmp_path / "s", "--campaign", "tinny")
+    assert "--campaign = tinny: must be one of other, tiny; did you mean 'tiny'?" in done.stderr
 
 
 def test_a_damaged_file_is_named_and_hides_no_other(tmp_path: Path) -> None:

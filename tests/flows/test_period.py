@@ -68,6 +68,7 @@ def test_days_and_periods_begin_at_midnight() -> None:
         ("yesterday", None, "must be a day such as"),
         ("2026-03-02", "2026-03-01", "is before --since"),
         (None, "2026-03-01", "is required"),
+        ("9999-01-01", None, "^--since = 9999-01-01: is in the future"),
     ],
 )
 def test_wrong_days_are_named(since: str | None, until: str | None, says: str) -> None:

@@ -8,3 +8,8 @@ export function localTimes(parent) {
   }
 }
 localTimes(document);
+
+// A page that is not complete yet loads itself again, unless somebody fills in its form.
+if (document.querySelector("[data-reading]")) {
+  setInterval(() => document.querySelector("form :focus") || location.reload(), 1000);
+}

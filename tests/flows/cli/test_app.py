@@ -179,12 +179,20 @@ def test_collect_takes_so_many_trials_and_no_more(tmp_path: Path) -> None:
     assert here("collect", *arguments, "--trials", 0).returncode == 2
 
 
-@pytest.mark.parametrize("command", ["status", "alerts"])
-def test_a_command_that_only_watches_ends_in_plain_words(
-    command: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("status", "no longer watching"),
+        ("alerts", "no longer watching; what waits is sent"),
+        ("page", "the page is closed"),
+        ("detect", "no longer detecting"),
+    ],
+)
+def test_an_endless_command_ends_in_plain_words(
+    command: str, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.argv", ["sliplab", command, "store"])
     ended = errors.interruption()
     assert ended.exit_code == 130
-    assert ended.message.startswith("interrupted: no longer watching")
+    assert ended.message.startswith(f"interrupted: {says}")
     assert "half-written" not in ended.message

@@ -289,6 +289,8 @@ def test_the_command_refuses_what_it_cannot_keep(tmp_path: Path) -> None:
         (("--context", "skin"), "must be NAME=VALUE"),
         (("x", "--campaign", "c"), "needs --skin or --context"),
         (("--who", "anna"), "needs a note, --skin or --context"),
+        (("--skin", "a b"), "--context: skin = a b: must be a text"),
+        (("--campaign", "c"), "--campaign = c: is not there: no campaign has begun"),
     ):
         done = here("log", tmp_path / "s", *given)
         assert done.returncode == 2, given

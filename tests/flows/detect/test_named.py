@@ -144,7 +144,7 @@ def test_what_cannot_be_had_is_said(tmp_path: Path) -> None:
     asked = ("detect", "--rig", RIG, "--seconds", "1", "--json")
     for options, said in (
         ((), "--model: is needed"),
-        (("--detector", "rat", "--level", "1"), "is a detector of a store"),
+        (("--detector", "rat", "--level", "1"), "one of a store needs the store as --model"),
         (("--detector", "rate", "--level", "1", "--margin", "2"), "is of the rule"),
     ):
         done = here(*asked, *options)

@@ -6,6 +6,7 @@ import base64
 import http.client
 import json
 import os
+import re
 import socket
 import stat
 import subprocess
@@ -130,12 +131,32 @@ def test_nobody_without_the_password(service: Service) -> None:
     assert service.page.call("/flow_runs/filter", {}) == []
 
 
+def test_every_route_of_prefect_is_closed(service: Service) -> None:
+    """By its own list: a new version's routes are tried, too."""
+    known = basic(service.page.password)
+    _, _, text = service.ask("GET", "/api/openapi.json", Authorization=known)
+    found = json.loads(text)["paths"]
+    assert len(found) > 50
+    for route, methods in found.items():
+        path = re.sub(r"{\w+}", "x", route if route.startswith("/api") else f"/api{route}")
+        for method in methods:
+            asked = method.upper(), path, None if method == "get" else "{}"
+            kind = {"Content_Type": "application/json"}
+            if path not in PUBLIC:
+                assert service.ask(*asked, **kind)[0] in {401, 403}, asked
+            sent = {**kind, "Authorization": known}
+            assert service.ask(*asked, **sent, Origin=EVIL)[0] == 403, asked
+            assert service.ask(*asked, **(sent | {"Host": "evil.example"}))[0] == 421, asked
+
+
 def test_a_change_needs_a_token_of_its_own(service: Service) -> None:
     known = {"Authorization": basic(service.page.password), "Content_Type": "application/json"}
     status, _, text = service.ask("POST", "/api/deployments/filter", "{}", **known)
     assert (status, "Missing CSRF token" in text) == (403, True)
 
 
+PUBLIC = ("/api/health", "/api/ready")
+"""Paths that need no password."""
 SOCKETS = (
     "/api/events/in",
     "/api/events/out",

@@ -10,14 +10,16 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
+from sliplab.flows.log import log_entries
+from sliplab.flows.web.access import OPEN
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.server.serving import serving, until
 from tests.flows.server.test_serve_access import EVIL, Service
+from tests.flows.web.test_gate import STREAM, routes
 
 pytestmark = pytest.mark.programs
-PAGES = ("/", "/live", "/trials", "/review", "/report", "/log", "/schedules")
 
 
 @pytest.fixture(scope="module")
@@ -40,26 +42,29 @@ def entered(service: Service, role: str) -> dict[str, str]:
     return {"Cookie": headers["set-cookie"].partition(";")[0]}
 
 
-@pytest.mark.parametrize("path", PAGES)
-def test_page_is_for_known_viewers_of_this_computer(service: Service, path: str) -> None:
-    assert service.ask("GET", path)[0] == 401
+def test_page_is_for_known_viewers_of_this_computer(service: Service, tmp_path: Path) -> None:
     reader = entered(service, "reader")
-    if path != "/live":  # which goes on
-        assert service.ask("GET", path, **reader)[0] == 200
-    assert service.ask("GET", path, **reader, Origin=EVIL)[0] == 403
-    assert service.handshake(path, **reader) == 403
-    status, _, text = service.ask("GET", path, **(reader | {"Host": "evil.example"}))
-    assert status == 421, text
+    for path, methods in routes(tmp_path / "store").items():
+        if path.startswith(OPEN):
+            continue
+        assert service.ask("GET", path)[0] == 401, path
+        if "GET" in methods and path != STREAM:
+            assert service.ask("GET", path, **reader)[0] in {200, 404}, path
+        assert service.ask("GET", path, **reader, Origin=EVIL)[0] == 403, path
+        assert service.handshake(path, **reader) == 403, path
+        assert service.ask("GET", path, **(reader | {"Host": "evil.example"}))[0] == 421, path
 
 
-def test_link_changes_nothing_without_its_form(service: Service) -> None:
+def test_link_changes_nothing_without_its_form(service: Service, tmp_path: Path) -> None:
     form = {"Content_Type": "application/x-www-form-urlencoded"}
     for role in ("reader", "operator"):
         known = entered(service, role)
-        for action in ("pause", "stop", "collect"):
-            body = "who=Eve&why=x&csrf=guess"
-            assert service.ask("POST", f"/control/{action}", body, **known, **form)[0] == 403
-    assert control.requests(Store.open(service.store)) == []
+        for path, methods in routes(tmp_path / role).items():
+            if "POST" in methods:
+                body = "who=Eve&why=x&text=x&csrf=guess"
+                assert service.ask("POST", path, body, **known, **form)[0] == 403, path
+    store = Store.open(service.store)
+    assert (control.requests(store), log_entries(store)) == ([], [])
 
 
 def test_links_are_no_way_into_prefects_interface(service: Service) -> None:

@@ -24,8 +24,8 @@ def opened(
     return found
 
 
-def csrf(browser: TestClient) -> str:
-    """The token of a browser's forms."""
-    viewer = ACCESS.viewer(dict(browser.cookies))
+def csrf(browser: TestClient, address: str = "") -> str:
+    """The token of a browser's forms at an address."""
+    viewer = ACCESS.viewer(dict(browser.cookies), address)
     assert isinstance(viewer, Viewer)
     return viewer.csrf

@@ -1,4 +1,7 @@
-"""A campaign of 40 trials driven from the page alone, in a real browser; the log says it all."""
+"""A campaign of 40 trials driven from the page alone, in a real browser; the log says it all.
+
+On `loopback`, whose real drivers work in real time, it takes some ten minutes.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,8 @@ from sliplab.flows.status import StatusReader
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.browser import launched, needs_browser, sync_api
+from tests.flows.conftest import write
+from tests.flows.live import quick, rig_yaml
 from tests.flows.server.serving import serving
 
 pytestmark = [needs_browser, pytest.mark.programs, pytest.mark.long]
@@ -43,12 +48,12 @@ class Person:
         part.get_by_role("button", name=button).click()
         self.tab.wait_for_url(f"{self._root}/")
 
-    def start(self, count: int, why: str) -> None:
-        """Start a run of the kinematic protocol."""
+    def start(self, protocol: str, count: int, why: str) -> None:
+        """Start a run of a protocol."""
         self.tab.goto(self._root)
         part = self.tab.locator("details", has=self.tab.locator("summary", has_text="Start"))
         part.locator("summary").click()
-        part.get_by_label("Protocol").select_option(label="kinematic.yaml")
+        part.get_by_label("Protocol").select_option(label=protocol)
         part.get_by_label("Trials at most").fill(str(count))
         part.get_by_label("Your name").fill(self.name)
         part.get_by_label("Reason").fill(why)
@@ -61,10 +66,11 @@ class Person:
         self.tab.get_by_role("button", name="Stop the arm").click()
         self.tab.wait_for_url(f"{self._root}/")
 
-    def note(self, text: str) -> None:
-        """Add a note to the log."""
+    def note(self, text: str, skin: str) -> None:
+        """Add a note to the log, and another skin."""
         self.tab.goto(f"{self._root}/log")
         self.tab.get_by_label("Note", exact=True).fill(text)
+        self.tab.get_by_label("New skin").fill(skin)
         self.tab.get_by_role("button", name="Add note").click()
         self.sees("td.text", text)
         self.tab.goto(self._root)
@@ -75,16 +81,17 @@ class Person:
         expect(self.tab.locator(place, has_text=text).first).to_be_visible(timeout=LIMIT_MS)
 
 
-def drive(browser: Any, link: str, folder: Path) -> None:
+def drive(browser: Any, link: str, folder: Path, protocol: str, planned: int) -> None:
     """Do what the first line says."""
     anna = Person(browser, link, "Anna")
-    anna.start(TRIALS, "first night")
+    anna.start(protocol, TRIALS, "first night")
     anna.tab.wait_for_selector("#now .phase")
     anna.tab.wait_for_selector("#pictures img")
     anna.act("Pause", "Pause after this trial", Reason="lens dirty")
     anna.sees("#status .notice", "Anna")
     anna.sees("#now .line", "paused before")
-    anna.note("lens cleaned, new skin 0043")
+    anna.note("lens cleaned", "0043")
+    anna.sees("#status li", "")  # what the new skin asks for
     anna.act("Resume", "Resume", Reason="")
     sync_api.expect(anna.tab.locator("#status .notice")).to_have_count(0, timeout=LIMIT_MS)
     anna.stop()
@@ -93,14 +100,15 @@ def drive(browser: Any, link: str, folder: Path) -> None:
     (status,) = StatusReader(store).read().campaigns
     assert status.committed < TRIALS
     ben = Person(browser, link, "Ben")
-    ben.start(TRIALS - status.committed, "goes on")
-    ben.sees("#status", f"{TRIALS} of 864 done")
+    ben.start(protocol, TRIALS - status.committed, "goes on")
+    ben.sees("#status", f"{TRIALS} of {planned} done")
     ben.sees("#now .big", "Nothing runs")
     (status,) = StatusReader(store).read().campaigns
     assert status.committed == TRIALS
     log = [(entry.what, entry.who, entry.text) for entry in log_entries(store)]
     assert ("pause", "Anna", "lens dirty") in log
-    assert ("note", "Anna", "lens cleaned, new skin 0043") in log
+    assert ("context", "Anna", "skin 0043, lens cleaned") in log
+    assert set(status.skins) == {"simulated-1", "0043"}
     assert ("resume", "Anna", "") in log
     assert ("stop", "Anna", "") in log
     assert [who for what, who, _ in log if what == "session"] == ["Anna", "Ben"]
@@ -109,7 +117,17 @@ def drive(browser: Any, link: str, folder: Path) -> None:
     assert "completed" in ends[-1]
 
 
-def test_campaign_is_driven_from_the_page_alone(tmp_path: Path) -> None:
-    rig, store = ROOT / "rigs" / "rehearsal.yaml", tmp_path / "store"
-    with serving(store, rig, "page", None, tmp_path / "serve.log"), launched() as browser:
-        drive(browser, (store / ".prefect" / "operator-link").read_text().strip(), store)
+@pytest.mark.parametrize("name", ["rehearsal", "loopback"])
+def test_campaign_is_driven_from_the_page_alone(name: str, tmp_path: Path) -> None:
+    rig, protocol, planned, schedules = ROOT / "rigs" / f"{name}.yaml", "kinematic.yaml", 864, None
+    if name == "loopback":  # in real time: 40 short slides, and an arm at an address of its own
+        write(tmp_path / "quick.yaml", quick(trials=2, repetitions=TRIALS // 2))
+        schedules = write(tmp_path / "schedules.yaml", {"timezone": "UTC", "schedules": []})
+        rig, protocol, planned = rig_yaml(tmp_path), "quick.yaml", TRIALS
+    store = tmp_path / "store"
+    with (
+        serving(store, rig, "page", None, tmp_path / "serve.log", schedules),
+        launched() as browser,
+    ):
+        link = (store / ".prefect" / "operator-link").read_text().strip()
+        drive(browser, link, store, protocol, planned)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
-from starlette.websockets import WebSocketDisconnect
 
 from sliplab.flows.collecting.live_feed import STATE, LiveFolder
 from sliplab.flows.log import log_entries
@@ -120,26 +119,10 @@ def test_stop_needs_no_name_and_is_in_the_log(store: Store) -> None:
     assert (entry.what, entry.who) == ("stop", "the page, operator's link")
 
 
-@pytest.mark.parametrize("action", ["pause", "resume", "stop", "skip", "again", "collect"])
-def test_reader_controls_nothing(store: Store, action: str) -> None:
-    reader = client(store, "reader")
-    page = reader.get("/").text
-    assert "/control/" not in page
-    assert act(reader, action, who="Eve", why="x", trials="a") == 403
-    assert control.requests(store) == []
-
-
 def test_start_without_a_service_says_the_command(store: Store) -> None:
     operator = client(store, "operator")
     assert "sliplab collect PROTOCOL" in operator.get("/").text
     assert act(operator, "collect", who="Anna", protocol="pilot.yaml") == 422
-
-
-def test_websocket_is_refused(store: Store) -> None:
-    operator = client(store, "operator")
-    with pytest.raises(WebSocketDisconnect) as refused, operator.websocket_connect("/live"):
-        pass
-    assert refused.value.code == 1008
 
 
 def test_schedules_show_next_runs(store: Store, tmp_path: Path) -> None:

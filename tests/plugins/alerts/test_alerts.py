@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
-import socketserver
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -23,7 +18,7 @@ from sliplab.flows.running import run_records
 from sliplab.flows.server.schedules import has_alerts
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
 from sliplab.plugins.alerts.conditions import Event, events
-from sliplab.plugins.alerts.outbox import Outbox, Target
+from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
 from sliplab.plugins.alerts.watcher import AlertWatcher, AppriseTarget
 from sliplab.protocols import InputError
@@ -35,6 +30,7 @@ from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.plugins.alerts.receivers import http_server, mail_server
 from tests.storage.trial_files import campaign, commit, fail
 
 NOW = datetime(2030, 3, 2, 22, 0, tzinfo=UTC)
@@ -122,7 +118,7 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     done = state(campaigns=[replace(RUNNING, missing=0, planned=4, nights_of_disk=None)])
     texts = {item.kind: item.text for item in [*found(store, at), *found(store, done)]}
     assert set(texts) == set(KINDS)
-    assert texts["run failed"] == "nightly failed: the arm did not answer"
+    assert texts["run failed"] == "collect of nightly failed: the arm did not answer"
     assert "pause by anna" in texts["paused"]
     assert "event_rate at the reference trial r2: -17.0 %" in texts["drift"]
     assert "no trial for 120 min" in texts["idle"]
@@ -230,7 +226,7 @@ def test_a_run_that_was_killed_is_told_once(tmp_path: Path) -> None:
     watching.look(NOW + timedelta(seconds=3))
     run_records.end(store.folder, run, "CRASHED", "its process was killed", "next start")
     watching.look(NOW + timedelta(seconds=6))
-    assert receiver.taken == ["nightly: its process is gone"]
+    assert receiver.taken == ["collect of nightly: its process is gone"]
 
 
 def test_a_grade_that_fell_between_two_looks_is_told(tmp_path: Path) -> None:
@@ -258,30 +254,6 @@ def test_a_summary_that_was_missed_is_sent_later_that_day(tmp_path: Path) -> Non
     watching.look(NOW)
     watching.look(NOW + timedelta(minutes=5))
     assert len(receiver.taken) == 1
-
-
-def test_each_kind_reaches_a_web_and_a_mail_server_within_ten_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = Store.create(tmp_path / "s")
-    with http_server() as (web, posted), mail_server() as (port, mails):
-        mail = f"mailto://127.0.0.1:{port}/?from=lab@example.org&to=anna@example.org"
-        targets: list[Target] = [AppriseTarget(f"json://127.0.0.1:{web}"), AppriseTarget(mail)]
-        now = datetime.now().astimezone()
-        watching = AlertWatcher(store, settings(), targets, now, lambda text: None)
-        monkeypatch.setattr(
-            "sliplab.plugins.alerts.watcher.events",
-            lambda *about: [Event(kind, kind, f"text of {kind}", now) for kind in KINDS],
-        )
-        began = time.monotonic()
-        while not (posted and mails) and time.monotonic() - began < 10:
-            watching.look(now)
-        assert time.monotonic() - began < 10
-        watching.look(now + timedelta(minutes=1))
-    for kind in KINDS:
-        assert f"text of {kind}" in posted[0]["message"]
-        assert f"text of {kind}" in mails[0].replace("=\r\n", "")
-    assert (len(posted), len(mails)) == (1, 1)
 
 
 def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
@@ -397,60 +369,6 @@ def test_a_rig_file_may_hold_the_alerts_and_its_copy_does_not(tmp_path: Path) ->
     assert same_rig(plain, text)
     path.write_text(copy)
     assert load_rig_file(path, stored=True)[0].alerts == "****"
-
-
-@contextmanager
-def http_server() -> Iterator[tuple[int, list[Any]]]:
-    """A server that keeps what is posted to it."""
-    posted: list[Any] = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, format: str, *args: Any) -> None:
-            """Print nothing."""
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server.server_port, posted
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-@contextmanager
-def mail_server() -> Iterator[tuple[int, list[str]]]:
-    """A mail server (SMTP) that keeps what it gets."""
-    mails: list[str] = []
-
-    class Handler(socketserver.StreamRequestHandler):
-        def handle(self) -> None:
-            self.wfile.write(b"220 test\r\n")
-            while line := self.rfile.readline():
-                verb = line[:4].upper()
-                if verb == b"DATA":
-                    self.wfile.write(b"354 go\r\n")
-                    body = b""
-                    while (part := self.rfile.readline()) != b".\r\n":
-                        body += part
-                    mails.append(body.decode())
-                self.wfile.write(b"221 bye\r\n" if verb == b"QUIT" else b"250 ok\r\n")
-                if verb == b"QUIT":
-                    return
-
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield server.server_address[1], mails
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 def test_messages_arrive_by_http_and_by_mail() -> None:

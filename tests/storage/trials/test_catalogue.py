@@ -13,7 +13,13 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.trials import catalogue as module
-from sliplab.storage.trials.catalogue import catalogue, check_table_path, query, write_table
+from sliplab.storage.trials.catalogue import (
+    catalogue,
+    catalogue_so_far,
+    check_table_path,
+    query,
+    write_table,
+)
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from tests.command_line import here
@@ -86,6 +92,25 @@ def test_only_what_changed_is_read_again(where: Campaign, read: list[str]) -> No
     _both(where)
 
 
+def test_reading_goes_on_where_its_time_ended(where: Campaign, read: list[str]) -> None:
+    store = _store(where)
+    for names in ("a", "ab", "abc"):  # the first of each is read in any case
+        table, left = catalogue_so_far(store, [], -1.0)
+        assert (list(table["trial"]), left) == (list(names), 3 - len(names))
+    assert read == ["a", "b", "c"]
+    assert len(_both(where)[0]) == 3
+
+
+def test_a_store_that_cannot_be_written_to_is_read_at_once(where: Any, monkeypatch: Any) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(module, "write_bytes", refuse)
+    table, left = catalogue_so_far(_store(where), [], -1.0)
+    assert (list(table["trial"]), left) == (["a", "b", "c"], 0)
+    assert not (_store(where).folder / INDEX).exists()
+
+
 def test_a_campaign_more_or_less_is_seen(where: Campaign) -> None:
     store = _store(where)
     catalogue(store)
@@ -146,15 +171,6 @@ def test_what_changed_just_now_is_not_trusted(where: Campaign, read: Any, monkey
     for _ in range(2):
         catalogue(_store(where))
     assert read == ["a", "b", "c"] * 2
-
-
-def test_a_store_that_cannot_be_written_to_has_a_catalogue(where: Any, monkeypatch: Any) -> None:
-    def refuse(path: Path, data: bytes) -> None:
-        raise PermissionError(path)
-
-    monkeypatch.setattr(module, "write_bytes", refuse)
-    assert list(catalogue(_store(where))["trial"]) == ["a", "b", "c"]
-    assert not (_store(where).folder / INDEX).exists()
 
 
 def test_conditions_become_columns_with_units(tmp_path: Path) -> None:
