@@ -13,7 +13,7 @@ import fcntl
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -41,22 +41,29 @@ def lock_names(file: RigFile) -> dict[str, str]:
 
 @contextmanager
 def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
-    """Lock a rig for this program while the block runs.
+    """Lock a rig for this program while the block runs; see `locked`."""
+    with locked(lock_names(file), store):
+        yield
+
+
+@contextmanager
+def locked(devices: Mapping[str, str], store: Path | None = None) -> Iterator[None]:
+    """Lock devices for this program while the block runs.
 
     Args:
+        devices: their descriptions by lock file name.
         store: the store that is written, shown to other programs that are refused.
 
     Raises:
         Locked: another program has the lock; the message names it, its user and its start time.
         RigError: the lock files cannot be created.
     """
-    names = lock_names(file)
     with ExitStack() as locks:
-        if names:
+        if devices:
             about = {} if store is None else {"store": str(store.absolute())}
             try:
                 folder = _folder(locks)
-                for name, what in names.items():
+                for name, what in devices.items():
                     locks.enter_context(exclusive(folder / name, what, mode=0o666, about=about))
             except (OSError, NoLocks) as error:
                 raise RigError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import threading
+import zlib
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
@@ -37,6 +38,7 @@ class FrameWriter:
         video: path of the video.
         spool: path of a file in which raw frames wait until `seal`; None to encode them at once.
         size_px: width and height of the frames; that of the first ones if left out.
+        guarded: put them on the disk within about a second, and compute a checksum of them.
     """
 
     def __init__(
@@ -46,8 +48,10 @@ class FrameWriter:
         spool: Path | None,
         rate_hz: int,
         size_px: tuple[int, int] | None = None,
+        guarded: bool = False,
     ) -> None:
         self._streams, self._path, self._rate_hz = streams, video, rate_hz
+        self._guarded, self._images, self._crc = guarded, 0, 0
         self._size_px, self._raw = size_px, spool
         self._spool: Spool | None = None
         self._video: VideoWriter | None = None
@@ -67,8 +71,16 @@ class FrameWriter:
             self._spool.write(chunk.images)
         else:
             if self._video is None:
-                self._video = VideoWriter(self._path, *self._size_px, self._rate_hz)
+                size, guarded = self._size_px, self._guarded
+                self._video = VideoWriter(self._path, *size, self._rate_hz, guarded=guarded)
+            if self._guarded:
+                self._images += len(chunk)
+                self._crc = zlib.crc32(np.ascontiguousarray(chunk.images), self._crc)
             self._video.write(chunk.images)
+
+    def mark(self) -> list[int]:
+        """Return how many images came, and their CRC-32."""
+        return [self._images, self._crc]
 
     def seal(self) -> None:
         """Finish the video."""

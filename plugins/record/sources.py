@@ -1,0 +1,336 @@
+"""What is recorded: the streams of a rig file or a file of streams, and those declared in code."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from sliplab.plugins.record.pushed import PushedStream
+from sliplab.plugins.record.table import CLOCK, chunk_type
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.timing import StreamTiming
+from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
+from sliplab.rigs.build import driven_stream, taught_frame
+from sliplab.rigs.core.device_stream import DeviceStream
+from sliplab.rigs.core.driver import ForceSensorDriver
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.stream_settings import (
+    NAME,
+    RESERVED,
+    Stream,
+    Streams,
+    stream_faults,
+)
+from sliplab.storage.schema.trial import StreamRecord
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
+    SCALAR,
+    WRENCH,
+    Chunk,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    PulseChunk,
+    ScalarChunk,
+    Sink,
+    WrenchChunk,
+)
+
+HOST, READS, TIMING = "host stamps", "clock readings", "timing"
+"""How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
+by the timing that its file says."""
+FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
+CLOCK_STREAM = "{}_clock"
+
+
+class StreamsFile(StrictModel):
+    """A file of streams: the section `streams` of a rig file by itself."""
+
+    streams: Streams
+
+    @rule
+    def _complete(self) -> Iterable[KeyedError]:
+        yield from stream_faults(self.streams, "devices", ("devices",))
+
+
+class SourceAbout(BaseModel):
+    """What a trial's record and its clocks need to know of a stream."""
+
+    record: StreamRecord
+    clock: str
+    uncertainty_ns: float | None = None
+    """Of stamps of the host's clock, where it is stated."""
+
+
+@dataclass
+class Source:
+    """A stream that is recorded.
+
+    Attributes:
+        clock: `HOST`, `READS` or `TIMING`.
+        uncertainty_ns: see `SourceAbout`.
+        locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
+        fault: why it has ended within the trial; None while it runs.
+        rows: that came in this trial.
+    """
+
+    stream: DeviceStream
+    clock: str = TIMING
+    uncertainty_ns: float | None = None
+    locks: Mapping[str, str] = field(default_factory=dict)
+    fault: str | None = None
+    rows: int = 0
+    _drained_ns: int = 0
+
+    @property
+    def name(self) -> str:
+        """The stream's name."""
+        return self.stream.name
+
+    @property
+    def device(self) -> Any:
+        """The device, or what takes a program's rows."""
+        return self.stream.device
+
+    @property
+    def about(self) -> SourceAbout:
+        """What a trial's record says of it."""
+        return SourceAbout(
+            record=self.stream.about, clock=self.clock, uncertainty_ns=self.uncertainty_ns
+        )
+
+    def expected(self) -> dict[str, tuple[Chunk, ...]]:
+        """Return empty chunks of what may come, by stream; the device is connected."""
+        clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
+        return {self.name: self._chunks()} | (clock if self.clock == READS else {})
+
+    def _chunks(self) -> tuple[Chunk, ...]:
+        kind, unit = self.stream.about.kind, self.stream.about.unit or ""
+        if kind == EVENTS_KIND:
+            return EventChunk.empty(), PulseChunk.empty()
+        if kind == FRAMES_KIND:
+            return FrameChunk.empty(), ClockReads.empty()
+        if kind == WRENCH.name:
+            return (WrenchChunk.empty(),)
+        if kind == SCALAR.name:
+            return (ScalarChunk.empty(unit),)
+        return (chunk_type(self.device.kind).empty(),)
+
+    def start(self) -> None:
+        """Start streaming. Raises RigError."""
+        self.fault, self.rows = None, 0
+        self.stream.start()
+        self._drained_ns = time.monotonic_ns()
+
+    def drain(self, sink: Sink, last: bool = False) -> None:
+        """Read what has come, and the clock. Raises RigError.
+
+        Args:
+            last: stop, and read what was sent before.
+        """
+        seen = _Newest(sink, self)
+        self.stream.drain(seen)
+        if last:
+            self.stream.finish(seen)
+        now = time.monotonic_ns()
+        if self.clock == READS:
+            reads = self._clock_reads(seen, now)
+            if len(reads.device_ns):
+                made = chunk_type(CLOCK)(**vars(reads))  # type: ignore[call-arg]
+                sink.add(CLOCK_STREAM.format(self.name), made)
+        self._drained_ns = now
+
+    def _clock_reads(self, seen: _Newest, now: int) -> ClockReads:
+        if hasattr(self.device, "clock_reads"):
+            found: ClockReads = self.device.clock_reads()
+            return found
+        if seen.newest_us is None:
+            return ClockReads.empty()
+        timing = self.stream.about.timing or StreamTiming()
+        # the newest event came after the call before, and was sent not longer before than its way
+        before = self._drained_ns - round(timing.delay.longest_us * 1000)
+        times = (np.array([each]) for each in (seen.newest_us * 1000, before, now))
+        return ClockReads(*times)
+
+
+class _Newest:
+    """A sink that counts a source's rows, and notes its newest event."""
+
+    def __init__(self, sink: Sink, source: Source) -> None:
+        self._sink, self._source = sink, source
+        self.newest_us: int | None = None
+
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, EventChunk) and len(chunk):
+            self.newest_us = int(chunk.t_us[-1])
+        if not isinstance(chunk, (PulseChunk, ClockReads)):
+            self._source.rows += len(chunk)
+        self._sink.add(device, chunk)
+
+
+def push(
+    name: str,
+    columns: Mapping[str, str] | None = None,
+    *,
+    events_px: tuple[int, int] | None = None,
+    frames_px: tuple[int, int] | None = None,
+    clock: str = "host",
+    uncertainty_ms: float | None = None,
+) -> Source:
+    """Declare a stream that the program pushes by `RecordedTrial.push`.
+
+    Args:
+        name: of the stream; ``events`` and ``frames`` are those that the analysis works on.
+        columns: of numbers: the unit of each column by its name.
+        events_px, frames_px: columns and rows of a camera, in place of columns.
+        clock: ``host``: times are of ``time.monotonic_ns()``; ``own``: of a clock of its own, which
+            is bounded by the times at which rows are pushed.
+        uncertainty_ms: bound of the error of times of the host's clock; None where it is unknown.
+
+    Raises:
+        InputError: an argument.
+    """
+    given = [each for each in (columns, events_px, frames_px) if each is not None]
+    if len(given) != 1:
+        raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
+    if clock not in {"host", "own"}:
+        raise InputError(name, "clock", clock, "must be host or own")
+    kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
+    _check_name(name, kind)
+    size = events_px or frames_px
+    device = PushedStream(name, columns, kind, size, clock == "host")
+    told: dict[str, Any] = {"kind": kind or (device.kind.name if device.kind else ""), "rows": 0}
+    if size is not None:
+        told["size_px"] = size
+    if device.unit:
+        told["unit"] = device.unit
+    if kind == FRAMES_KIND:
+        told["mid_exposure_ns"] = 0
+    if clock == "own":
+        grade = "host arrival" if kind == FRAMES_KIND else "host time"
+        told["timing"] = StreamTiming(grade=grade)
+        how = READS if kind == EVENTS_KIND else TIMING
+    else:
+        how = HOST
+    error = None if uncertainty_ms is None else uncertainty_ms * 1e6
+    return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
+
+
+def usb_camera(
+    name: str, device: str, size_px: tuple[int, int], rate_hz: float = 30.0, **settings: Any
+) -> Source:
+    """Declare a USB camera, or a stream that OpenCV opens.
+
+    Args:
+        device: path of the camera, or a URL. settings: see docs/cameras.md.
+
+    Raises:
+        InputError: a setting. RigError: it cannot be opened.
+    """
+    width, height = size_px
+    about = {
+        "kind": FRAMES_KIND,
+        "scale_px_per_mm": 1.0,
+        "region_px": [width, height],
+        "rate_hz": rate_hz,
+        "timing": {"grade": "host arrival"},
+        "device": {
+            "driver": "uvc",
+            "device": device,
+            "width_px": width,
+            "height_px": height,
+            "rate_hz": rate_hz,
+            **settings,
+        },
+    }
+    return declared(name, about)
+
+
+def declared(name: str, about: Mapping[str, Any]) -> Source:
+    """Return a stream as a rig file declares it below `streams`. Raises InputError, RigError."""
+    file = validate(StreamsFile, {"streams": {name: dict(about)}}, name)
+    return _driven(name, file.streams[name], PlateFrame.taught(_FLAT))
+
+
+_FLAT = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+"""Axes of a plate that nobody taught: forces stay in those of the sensor."""
+
+
+def opened(streams: Iterable[str | Path | Source]) -> list[Source]:
+    """Return the streams of files and of code; cameras are open, nothing is connected.
+
+    Raises:
+        InputError: a file or a name. RigError: a device.
+    """
+    found: list[Source] = []
+    for each in streams:
+        found += [each] if isinstance(each, Source) else _of_text(str(each))
+    names = [source.name for source in found]
+    if not names:
+        raise InputError("streams", "", None, "names no stream")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError("streams", "", twice[0], "is the name of two streams")
+    return found
+
+
+def _of_text(text: str) -> list[Source]:
+    path = Path(text)
+    if not path.suffix and not path.exists() and ":" in text:
+        from sliplab.plugins.record.short import short
+
+        return [short(text)]
+    data = parse_yaml(read_text(path, "file of streams"), path) if path.suffix else {"driver": ""}
+    if "driver" not in data and "extends" not in data:
+        file = validate(StreamsFile, data, path)
+        flat = PlateFrame.taught(_FLAT)
+        return [_driven(name, stream, flat) for name, stream in file.streams.items()]
+    return _of_rig(path)
+
+
+def _of_rig(path: Path) -> list[Source]:
+    """Return cameras and further streams of a rig file; neither arm nor gripper."""
+    rig, _ = load_rig_file(path)
+    if rig.driver != "devices" or rig.devices is None:
+        raise InputError(path, "driver", rig.driver, "must be devices: only those can be recorded")
+    found, frame = [], taught_frame(rig)
+    devices = rig.devices
+    if "events" in rig.cameras:
+        camera = devices.event_camera_driver.build(devices.event_camera)
+        record = StreamRecord(
+            kind=EVENTS_KIND,
+            rows=0,
+            size_px=(camera.width, camera.height),
+            timing=StreamTiming(grade="device time stamps"),
+        )
+        stream = DeviceStream(EVENTS_KIND, camera, record)
+        locks = devices.event_camera_driver.locks(devices.event_camera)
+        found.append(Source(stream, READS, locks=locks))
+    for name, stream_settings in rig.streams.items():
+        found.append(_driven(name, stream_settings, frame))
+    return found
+
+
+def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
+    driver = stream.driver
+    assert driver is not None
+    if isinstance(driver, ForceSensorDriver) and driver.of_arm:
+        raise InputError(name, "driver", driver.name, "measures through an arm, which is not there")
+    made = driven_stream(name, stream, None, plate)  # type: ignore[arg-type]
+    by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
+    return Source(made, READS if by_reads else TIMING, locks=driver.locks(stream.device))
+
+
+def _check_name(name: str, kind: str | None) -> None:
+    if not NAME.fullmatch(name):
+        raise InputError("streams", "", name, f"a stream's name must match {NAME.pattern}")
+    if name in RESERVED | {"marks"} and name != kind:
+        raise InputError("streams", "", name, "is the name of another stream; choose another one")
