@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     )
     from sliplab.flows.collecting.requests import CampaignStopped
     from sliplab.plugins.record.recorder import record
-    from sliplab.plugins.record.sources import push, usb_camera
+    from sliplab.plugins.record.sources import columns, lsl, push, usb_camera
     from sliplab.protocols.errors import InputError
     from sliplab.protocols.plan import Plan
     from sliplab.storage.errors import StoreError
@@ -68,9 +68,11 @@ __all__ = [
     "__version__",
     "check",
     "collect",
+    "columns",
     "export",
     "import_data",
     "load_model",
+    "lsl",
     "open_store",
     "plan",
     "push",
@@ -81,6 +83,8 @@ __all__ = [
 __version__: str
 
 _ELSEWHERE = {
+    "columns": "sliplab.plugins.record.sources",
+    "lsl": "sliplab.plugins.record.sources",
     "push": "sliplab.plugins.record.sources",
     "record": "sliplab.plugins.record.recorder",
     "usb_camera": "sliplab.plugins.record.sources",

@@ -7,5 +7,6 @@ from sliplab.protocols.plugin import Plugin
 _HERE = "sliplab.plugins.record"
 PLUGIN = Plugin(
     commands={"record": f"{_HERE}.command:app"},
+    drivers={"columns": f"{_HERE}.columns:DRIVER", "lsl": f"{_HERE}.lsl:DRIVER"},
     hooks={"salvage": f"{_HERE}.salvage:salvage"},
 )

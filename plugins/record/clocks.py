@@ -19,6 +19,7 @@ from sliplab.analysis.clocks.synchronise import (
     synchronise,
 )
 from sliplab.plugins.record.sources import CLOCK_STREAM, HOST, READS, SourceAbout
+from sliplab.plugins.record.table import CLOCK
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema.trial import DeviceRecord
@@ -56,30 +57,35 @@ def fit_clocks(
     if not timed:
         return result
     by_timing = {name: each.record for name, each in timed.items() if each.clock != READS}
-    inputs = clocks_in(folder, by_timing)
+    inputs, errors = clocks_in(folder, by_timing), {}
     with StreamReader(folder / DATA) as reader:
         for name, source in timed.items():
             if source.clock == READS:
                 timing = source.record.timing or StreamTiming()
-                read = timing.model_copy(update={"grade": "device time stamps"})
-                inputs[name] = ClockInput(read, reads=_reads(reader, name))
+                how = timing.model_copy(update={"grade": "device time stamps"})
+                reads, errors[name] = _reads(reader, name)
+                inputs[name] = ClockInput(how, reads=reads)
         streams = streams_of(reader, None, inputs)
     host = np.array([span_ns[0], sum(span_ns) // 2, span_ns[1]], np.int64)
     streams = replace(streams, named=inputs, box_reads=ClockReads(host, host, host))
     fitted = synchronise(streams, Timing(arm="host time"), 1, with_events=False)
     for name in timed:
-        if name in fitted.devices:
-            result.found[name] = fitted.devices[name].record()
-        else:
+        if name not in fitted.devices:
             result.refused[name] = fitted.refused[name]
+            continue
+        record, error = fitted.devices[name].record(), errors.get(name, 0)
+        bound = (record.uncertainty_ns or 0.0) + error
+        result.found[name] = record.model_copy(update={"uncertainty_ns": bound})
     return result
 
 
-def _reads(reader: StreamReader, name: str) -> ClockReads:
-    """Return the readings of a stream's clock; some thousand say as much as all."""
+def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:
+    """Return the readings of a stream's clock, and what else its times may be off, ns.
+
+    Some thousand readings say as much as all.
+    """
     group = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}"
-    if not reader.has(f"{group}/t"):
-        return ClockReads.empty()
-    columns = [reader.column(f"{group}/{part}") for part in ("t", "before", "after")]
-    some = slice(None, None, max(1, len(columns[0]) // 4000))
-    return ClockReads(*(column[some] for column in columns))
+    t_ns, before, after, error = (reader.column(f"{group}/{part}") for part in CLOCK.columns)
+    some = slice(None, None, max(1, len(t_ns) // 4000))
+    reads = ClockReads(t_ns[some], (before - error)[some], (after + error)[some])
+    return reads, int(error.max(initial=0))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
-from sliplab.plugins.record.table import CLOCK, chunk_type
+from sliplab.plugins.record.table import CLOCK, chunk_type, rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.timing import StreamTiming
@@ -143,23 +143,21 @@ class Source:
             self.stream.finish(seen)
         now = time.monotonic_ns()
         if self.clock == READS:
-            reads = self._clock_reads(seen, now)
-            if len(reads.device_ns):
-                made = chunk_type(CLOCK)(**vars(reads))  # type: ignore[call-arg]
-                sink.add(CLOCK_STREAM.format(self.name), made)
+            sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
         self._drained_ns = now
 
-    def _clock_reads(self, seen: _Newest, now: int) -> ClockReads:
+    def _clock_reads(self, seen: _Newest, now: int) -> Chunk:
+        """Return readings of the clock since the last call, a chunk of the kind `CLOCK`."""
         if hasattr(self.device, "clock_reads"):
-            found: ClockReads = self.device.clock_reads()
+            found: Chunk = self.device.clock_reads()
             return found
         if seen.newest_us is None:
-            return ClockReads.empty()
+            return chunk_type(CLOCK).empty()
         timing = self.stream.about.timing or StreamTiming()
         # the newest event came after the call before, and was sent not longer before than its way
         before = self._drained_ns - round(timing.delay.longest_us * 1000)
-        times = (np.array([each]) for each in (seen.newest_us * 1000, before, now))
-        return ClockReads(*times)
+        read = {"t": [seen.newest_us * 1000], "before": [before], "after": [now], "error": [0]}
+        return rows(CLOCK, "", read)
 
 
 class _Newest:
@@ -255,13 +253,44 @@ def usb_camera(
     return declared(name, about)
 
 
+def columns(name: str, place: str, units: Mapping[str, str], **settings: Any) -> Source:
+    """Declare a stream of numbers from a serial port or a socket.
+
+    Args:
+        place: ``/dev/ttyACM0``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
+        units: of each column by its name, in their order.
+        settings: see `plugins.record.columns.ColumnsSettings`.
+
+    Raises:
+        InputError: a setting.
+    """
+    grade = "host arrival" if settings.get("time_column") is None else "host time"
+    about = {"driver": "columns", "place": place, "columns": dict(units), **settings}
+    return declared(name, {"kind": "table", "timing": {"grade": grade}, "device": about})
+
+
+def lsl(stream: str, name: str | None = None, **settings: Any) -> Source:
+    """Declare a stream of the Lab Streaming Layer.
+
+    Args:
+        stream: its name there. name: in the store; made of that by default.
+        settings: `source_id` where several senders have it, `find_s` to wait longer.
+
+    Raises:
+        InputError: a setting.
+    """
+    name = name or re.sub(r"[^a-z0-9_]+", "_", stream.lower()).strip("_")[:24]
+    about = {"driver": "lsl", "name": stream, **settings}
+    return declared(name, {"kind": "table", "timing": {"grade": "host time"}, "device": about})
+
+
 def declared(name: str, about: Mapping[str, Any]) -> Source:
     """Return a stream as a rig file declares it below `streams`. Raises InputError, RigError."""
     file = validate(StreamsFile, {"streams": {name: dict(about)}}, name)
     return _driven(name, file.streams[name], PlateFrame.taught(_FLAT))
 
 
-_FLAT = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+_FLAT = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))
 """Axes of a plate that nobody taught: forces stay in those of the sensor."""
 
 

@@ -15,7 +15,8 @@ from sliplab.storage.streams import READS, SCALAR, Chunk, Column, ScalarChunk, S
 
 _COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
-CLOCK = StreamKind("clock", READS.columns)
+_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
+CLOCK = StreamKind("clock", READS.columns | {"error": _ERROR})
 """Readings of a stream's clock: its time, and between which two times of the host that was."""
 
 
