@@ -33,7 +33,7 @@ def lock_names(file: RigFile) -> dict[str, str]:
     if file.simulated:
         return {}
     return {
-        f"{_plain(name)}.lock": f"{what} (rig {file.name})"
+        lock_file(name): f"{what} (rig {file.name})"
         for _, driver, settings in file.drivers()
         for name, what in driver.locks(settings).items()
     }
@@ -89,6 +89,11 @@ def _folder(locks: ExitStack) -> Path:
         raise OSError(errno.EPERM, text, str(folder))
     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from cleaning it up
     return folder
+
+
+def lock_file(name: str) -> str:
+    """Return the name of a device's lock file."""
+    return f"{_plain(name)}.lock"
 
 
 def _plain(name: str) -> str:

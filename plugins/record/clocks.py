@@ -18,7 +18,7 @@ from sliplab.analysis.clocks.synchronise import (
     streams_of,
     synchronise,
 )
-from sliplab.plugins.record.sources import CLOCK_STREAM, HOST, READS, SourceAbout
+from sliplab.plugins.record.sources import CLOCK_STREAM, FIRST_CAMERAS, HOST, READS, SourceAbout
 from sliplab.plugins.record.table import CLOCK
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
@@ -56,7 +56,11 @@ def fit_clocks(
             timed[name] = source
     if not timed:
         return result
-    by_timing = {name: each.record for name, each in timed.items() if each.clock != READS}
+    by_timing = {
+        name: each.record
+        for name, each in timed.items()
+        if each.clock != READS and name not in FIRST_CAMERAS
+    }
     inputs, errors = clocks_in(folder, by_timing), {}
     with StreamReader(folder / DATA) as reader:
         for name, source in timed.items():
@@ -65,6 +69,10 @@ def fit_clocks(
                 how = timing.model_copy(update={"grade": "device time stamps"})
                 reads, errors[name] = _reads(reader, name)
                 inputs[name] = ClockInput(how, reads=reads)
+            elif name in FIRST_CAMERAS:
+                mid_ns = source.record.mid_exposure_ns or 0
+                reads = reader.clock_reads("frame_camera_reads")
+                inputs[name] = ClockInput(source.record.timing, reads=reads, mid_exposure_ns=mid_ns)
         streams = streams_of(reader, None, inputs)
     host = np.array([span_ns[0], sum(span_ns) // 2, span_ns[1]], np.int64)
     streams = replace(streams, named=inputs, box_reads=ClockReads(host, host, host))

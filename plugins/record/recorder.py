@@ -31,7 +31,7 @@ from sliplab.plugins.record.trial_record import MARKS, BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.rig_lock import locked
+from sliplab.rigs.rig_lock import lock_file, locked
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import safe_name, write_json
 from sliplab.storage.interrupts import uninterrupted
@@ -107,7 +107,11 @@ class Recorder:
             self.sources = opened(self._streams)
             for source in self.sources:
                 undo.callback(source.stream.close)
-            locks = {key: what for source in self.sources for key, what in source.locks.items()}
+            locks = {
+                lock_file(name): what
+                for source in self.sources
+                for name, what in source.locks.items()
+            }
             undo.enter_context(locked(locks, self._store))
             self._experiment = join(self.campaign, self._analysis, self._simulated, self.sources)
             self.salvaged = salvage_campaign(self.campaign)

@@ -48,6 +48,7 @@ from sliplab.storage.streams import (
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"
 """How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
 by the timing that its file says."""
+_SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
 FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
 CLOCK_STREAM = "{}_clock"
 
@@ -286,8 +287,9 @@ def lsl(stream: str, name: str | None = None, **settings: Any) -> Source:
 
 def declared(name: str, about: Mapping[str, Any]) -> Source:
     """Return a stream as a rig file declares it below `streams`. Raises InputError, RigError."""
-    file = validate(StreamsFile, {"streams": {name: dict(about)}}, name)
-    return _driven(name, file.streams[name], PlateFrame.taught(_FLAT))
+    known = name if name not in FIRST_CAMERAS else "camera"
+    file = validate(StreamsFile, {"streams": {known: dict(about)}}, name)
+    return _driven(name, file.streams[known], PlateFrame.taught(_FLAT))
 
 
 _FLAT = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))
@@ -312,13 +314,19 @@ def opened(streams: Iterable[str | Path | Source]) -> list[Source]:
 
 
 def _of_text(text: str) -> list[Source]:
+    """Return the streams of a file, or the one that a short form names."""
+    if found := _SHORT.fullmatch(text):
+        name, kind, place = found.groups()
+        if kind == "lsl":
+            return [lsl(place, name)]
+        device, _, size = place.partition("@")
+        width, x, height = (size or "1280x720").partition("x")
+        if not (x and width.isdecimal() and height.isdecimal()):
+            raise InputError("STREAMS", "", text, "must be usb:DEVICE@WIDTHxHEIGHT")
+        return [usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))]
     path = Path(text)
-    if not path.suffix and not path.exists() and ":" in text:
-        from sliplab.plugins.record.short import short
-
-        return [short(text)]
-    data = parse_yaml(read_text(path, "file of streams"), path) if path.suffix else {"driver": ""}
-    if "driver" not in data and "extends" not in data:
+    data = parse_yaml(read_text(path, "file of streams"), path)
+    if "driver" not in data and "extends" not in data and "devices" not in data:
         file = validate(StreamsFile, data, path)
         flat = PlateFrame.taught(_FLAT)
         return [_driven(name, stream, flat) for name, stream in file.streams.items()]

@@ -76,22 +76,10 @@ def make_record(
     counted = {name: rows for name, (rows, _) in streams.items()}
     present = {name: each for name, each in begun.sources.items() if counted.get(name)}
     clocks = fit_clocks(folder, present, span)
-    gates = {f"clock_{name}": Gate(passed=False, value=why) for name, why in clocks.refused.items()}
-    about = {
-        "format": FORMAT,
-        "from": "sliplab record",
-        "epoch": "the host's monotonic clock",
-        "unknown": () if begun.condition else ("condition",),
-        "warnings": (
-            *warnings,
-            *(
-                f"nothing came from {name}"
-                for name in begun.sources
-                if name not in {*present, MARKS}
-            ),
-            *(f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()),
-        ),
-        "span_ns": span,
+    gates = {
+        f"clock_{name}": Gate(passed=False, value=why)
+        for name, why in clocks.refused.items()
+        if name in FIRST_CAMERAS  # which the analysis works on
     }
     more = {
         "given": _given(folder, begun, span, counted),
