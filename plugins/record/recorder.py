@@ -25,9 +25,8 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
-from sliplab.plugins.record.sources import HOST, Source, SourceAbout, opened
-from sliplab.plugins.record.table import chunk_type, table_kind
-from sliplab.plugins.record.trial_record import MARKS, BegunTrial, make_record
+from sliplab.plugins.record.sources import Source, opened
+from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
 from sliplab.rigs.core.capabilities import RigError
@@ -35,7 +34,7 @@ from sliplab.rigs.rig_lock import lock_file, locked
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import safe_name, write_json
 from sliplab.storage.interrupts import uninterrupted
-from sliplab.storage.schema.trial import Provenance, StreamRecord
+from sliplab.storage.schema.trial import Mark, Provenance
 from sliplab.storage.streams import FRAMES_KIND, Chunk
 from sliplab.storage.trials.prefix_journal import BEGUN
 from sliplab.storage.trials.store import Campaign, Store
@@ -49,8 +48,6 @@ TAIL_S = 0.1
 """Time for which streams are read after the end of a trial: data are on their way, s."""
 START_S, END_S = 60.0, 600.0
 """Longest time for devices to start; and for a trial to end, which fits clocks and seals files."""
-MARK_KIND = table_kind({"code": "", "error": "ns"})
-_MARKS = {MARKS: SourceAbout(record=StreamRecord(kind=MARK_KIND.name, rows=0), clock=HOST)}
 _FRAME_RATE = 100
 """Time base of videos only."""
 _UNITS = {each.symbol.lower().replace("/", "_"): each.symbol for each in TABLE}
@@ -181,8 +178,7 @@ class RecordedTrial:
         self._error: BaseException | None = None
         self._ended_by = ""
         self._lock = threading.Lock()
-        self._marks: list[tuple[int, str, float]] = []
-        self._last_mark_ns = 0
+        self._marks: list[Mark] = []
         self.begin_ns = self._end_ns = 0
         self.bytes_written = 0
 
@@ -259,9 +255,9 @@ class RecordedTrial:
         if not name or not name.isprintable() or len(name) > 100:
             raise InputError("mark", "", name, "must be printable text of 100 characters at most")
         at = time.monotonic_ns() if t_ns is None else int(t_ns)
-        error = float("nan") if uncertainty_ms is None else uncertainty_ms * 1e6
+        error = None if uncertainty_ms is None else uncertainty_ms * 1e6
         with self._lock:
-            self._marks.append((at, name, error))
+            self._marks.append(Mark(name=name, t_ns=at, uncertainty_ns=error))
 
     def rows(self) -> dict[str, int]:
         """Return the rows of each stream so far."""
@@ -300,7 +296,7 @@ class RecordedTrial:
     def _record(self) -> None:
         recorder = self._recorder
         self.id, repetition = recorder._next_id()
-        expected = {MARKS: (chunk_type(MARK_KIND).empty(),)}
+        expected: dict[str, tuple[Chunk, ...]] = {}
         for source in recorder.sources:
             expected |= source.expected()
         first = next((s for s in recorder.sources if s.name == FRAMES_KIND), None)
@@ -316,7 +312,7 @@ class RecordedTrial:
             begin_ns=time.monotonic_ns(),
             started=datetime.now(UTC).isoformat(timespec="milliseconds"),
             operator=recorder._operator,
-            sources={source.name: source.about for source in recorder.sources} | _MARKS,
+            sources={source.name: source.about for source in recorder.sources},
         )
         try:
             self._stream(writer, begun)
@@ -365,24 +361,11 @@ class RecordedTrial:
                 source.drain(writer, last)
             except RigError as error:  # the others continue
                 source.fault = self.faults[source.name] = str(error)
-        self._write_marks(writer, begun)
-
-    def _write_marks(self, writer: TrialWriter, begun: BegunTrial) -> None:
         with self._lock:
-            marks, self._marks = sorted(self._marks), []
-        if not marks:
-            return
-        if new := [name for _, name, _ in marks if name not in begun.marks]:
-            begun.marks += dict.fromkeys(new)
+            marks, self._marks = self._marks, []
+        if marks:
+            begun.marks += marks
             write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
-        # a time before that of an earlier mark cannot be stored behind it
-        times = np.maximum([t for t, *_ in marks], self._last_mark_ns)
-        self._last_mark_ns = int(times[-1])
-        now = np.full(len(marks), time.monotonic_ns())
-        codes = np.array([float(begun.marks.index(name)) for _, name, _ in marks])
-        errors = np.array([error for *_, error in marks])
-        chunk: Chunk = chunk_type(MARK_KIND)(times, now, codes, errors)  # type: ignore[call-arg]
-        writer.add(MARKS, chunk)
 
     def _commit(self, writer: TrialWriter, begun: BegunTrial) -> None:
         """Fit the clocks, and commit the trial."""

@@ -369,5 +369,5 @@ def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
 def _check_name(name: str, kind: str | None) -> None:
     if not NAME.fullmatch(name):
         raise InputError("streams", "", name, f"a stream's name must match {NAME.pattern}")
-    if name in RESERVED | {"marks"} and name != kind:
+    if name in RESERVED and name != kind:
         raise InputError("streams", "", name, "is the name of another stream; choose another one")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, Field
 
 from sliplab.plugins.record.clocks import Clocks, fit_clocks
@@ -17,6 +16,7 @@ from sliplab.storage.schema.trial import (
     Given,
     Imported,
     Lost,
+    Mark,
     StreamCounts,
     StreamRecord,
     TrialClockMaps,
@@ -26,9 +26,8 @@ from sliplab.storage.schema.trial import (
 from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
-from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 
-FORMAT, MARKS = "record", "marks"
+FORMAT = "record"
 INCIPIENT, GROSS = ("slip", "incipient"), ("gross",)
 """Names of marks that are onsets; only the first of each counts."""
 
@@ -38,7 +37,6 @@ class BegunTrial(BaseModel):
 
     Attributes:
         begin_ns: on the host's clock. started: UTC, ISO 8601.
-        marks: names of marks; the stream `MARKS` has their places in this list.
     """
 
     trial: str
@@ -51,7 +49,7 @@ class BegunTrial(BaseModel):
     started: str
     operator: str = ""
     sources: dict[str, SourceAbout]
-    marks: list[str] = Field(default_factory=list)
+    marks: list[Mark] = Field(default_factory=list)
 
 
 def make_record(
@@ -81,8 +79,22 @@ def make_record(
         for name, why in clocks.refused.items()
         if name in FIRST_CAMERAS  # which the analysis works on
     }
+    marks = tuple(sorted(begun.marks, key=lambda mark: mark.t_ns))
+    inside = [mark for mark in marks if span[0] <= mark.t_ns <= span[1]]
+    notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
+    notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
+    notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
+    about = {
+        "format": FORMAT,
+        "from": "sliplab record",
+        "epoch": "the host's monotonic clock",
+        "unknown": () if begun.condition else ("condition",),
+        "warnings": (*warnings, *notes),
+        "span_ns": span,
+    }
     more = {
-        "given": _given(folder, begun, span, counted),
+        "given": _given(inside),
+        "marks": marks,
         "lost": lost,
         "dropped": dict(dropped or {}),
     }
@@ -159,25 +171,16 @@ def _streams(folder: Path, begun: BegunTrial) -> dict[str, tuple[int, StreamReco
     return found
 
 
-def _given(
-    folder: Path, begun: BegunTrial, span: tuple[int, int], counted: Mapping[str, int]
-) -> Given | None:
+def _given(marks: Sequence[Mark]) -> Given | None:
     """Return the onsets that marks state, and the bound of their error."""
-    if not counted.get(MARKS):
+    first: dict[str, Mark] = {}
+    for mark in marks:
+        key = {**dict.fromkeys(INCIPIENT, "incipient_ns"), **dict.fromkeys(GROSS, "gross_ns")}
+        if mark.name in key:
+            first.setdefault(key[mark.name], mark)
+    if not first:
         return None
-    with StreamReader(folder / DATA) as reader:
-        t_ns, code, error = (
-            reader.column(f"{STREAM_GROUP}/{MARKS}/{part}") for part in ("t", "code", "error")
-        )
-    onsets: dict[str, int] = {}
-    errors = []
-    for key, names in (("incipient_ns", INCIPIENT), ("gross_ns", GROSS)):
-        codes = [index for index, name in enumerate(begun.marks) if name in names]
-        at = np.flatnonzero(np.isin(code, codes))
-        if len(at):
-            onsets[key] = int(np.clip(t_ns[at[0]], *span))
-            errors.append(float(error[at[0]]))
-    if not onsets:
-        return None
-    bound = max(errors)
-    return Given(source=MARKS, uncertainty_ns=bound if np.isfinite(bound) else None, **onsets)
+    errors = [mark.uncertainty_ns for mark in first.values()]
+    bound = None if None in errors else max(error for error in errors if error is not None)
+    onsets = {key: mark.t_ns for key, mark in first.items()}
+    return Given(source="marks", uncertainty_ns=bound, **onsets)

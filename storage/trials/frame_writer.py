@@ -38,7 +38,7 @@ class FrameWriter:
         video: path of the video.
         spool: path of a file in which raw frames wait until `seal`; None to encode them at once.
         size_px: width and height of the frames; that of the first ones if left out.
-        guarded: put them on the disk within about a second, and compute a checksum of them.
+        guarded: write them at once, for a program that may be killed, and compute a checksum.
     """
 
     def __init__(

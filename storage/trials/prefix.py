@@ -28,7 +28,6 @@ from sliplab.storage.trials.superblock import HEAD_BYTES, closed
 from sliplab.storage.trials.video import cut_video, read_frames
 
 _BLOCK = 1 << 18
-_FAULTS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 
 def keep_prefix(folder: Path) -> Json | None:
@@ -87,7 +86,7 @@ def _last_match(folder: Path, name: str, states: Sequence[Json]) -> int:
             for column in states[0]["columns"]:
                 counts = [state["columns"][column] for state in states[: last + 1]]
                 last = _matching(counts, _reader(file[column]))
-    except _FAULTS as error:
+    except Exception as error:  # of HDF5, about a file that may have any damage
         if own_fault(error):
             raise
         return -1
@@ -110,7 +109,7 @@ def _matching(counts: Sequence[Sequence[int]], read: Callable[[int, int], Iterab
         try:
             for block in read(done, rows):
                 crc = zlib.crc32(np.ascontiguousarray(block), crc)
-        except (*_FAULTS, StopIteration) as error:
+        except Exception as error:  # of HDF5 or FFmpeg, about what may have any damage
             if own_fault(error):
                 raise
             return index - 1

@@ -29,7 +29,8 @@ else:
     av = Later("av")
 
 CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
-_OFTEN = {"cluster_time_limit": "500", "flush_packets": "1"}
+_AT_ONCE = {"cluster_time_limit": "1", "flush_packets": "1"}
+"""A cluster a frame: Matroska's writer holds a cluster back until the next one begins."""
 _QUEUE_FRAMES = 32
 _PUT_TIMEOUT_S = 60.0
 
@@ -45,7 +46,7 @@ class VideoWriter:
     The file does not depend on the number of threads.
 
     Args:
-        guarded: put frames on the disk within about a second, for a program that is killed.
+        guarded: write each frame when the next one comes, for a program that may be killed.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class VideoWriter:
         self.width, self.height = width, height
         self.frames = 0
         self._time_base = Fraction(1, rate_hz)
-        options = {"fflags": "+bitexact"} | (_OFTEN if guarded else {})
+        options = {"fflags": "+bitexact"} | (_AT_ONCE if guarded else {})
         self._container = av.open(video_url(path), "w", format="matroska", options=options)
         self._stream = self._container.add_stream("ffv1", rate=rate_hz, options=CODEC_OPTIONS)
         encoders = [self._stream.codec_context]
