@@ -88,6 +88,11 @@ class VideoWriter:
         for thread in self._threads:
             thread.start()
 
+    @property
+    def muxed(self) -> int:
+        """Frames that were handed to the file."""
+        return self._muxed
+
     def write(self, images: U8) -> None:
         """Append frames of shape (n, height, width), grey, uint8.
 

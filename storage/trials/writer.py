@@ -259,6 +259,8 @@ class _Files:
 
     def seal(self) -> None:
         """Finish the files."""
+        if self.frames is not None:
+            self.frames.settle()
         self.streams.finish()
         if self.frames is not None:
             self.frames.seal()
