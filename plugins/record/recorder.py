@@ -101,9 +101,7 @@ class Recorder:
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
-            self.sources = opened(self._streams)
-            for source in self.sources:
-                undo.callback(source.stream.close)
+            self.sources = opened(self._streams, undo)
             locks = {
                 lock_file(name): what
                 for source in self.sources

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.table import CLOCK, chunk_type, rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.timing import StreamTiming
+from sliplab.protocols.timing import WIRED, StreamTiming
 from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
 from sliplab.rigs.build import driven_stream, taught_frame
 from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.driver import ForceSensorDriver
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.device_section import DeviceSettings
+from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.stream_settings import (
     NAME,
     RESERVED,
@@ -296,64 +298,90 @@ _FLAT = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))
 """Axes of a plate that nobody taught: forces stay in those of the sensor."""
 
 
-def opened(streams: Iterable[str | Path | Source]) -> list[Source]:
+def opened(streams: Iterable[str | Path | Source], undo: ExitStack) -> list[Source]:
     """Return the streams of files and of code; cameras are open, nothing is connected.
+
+    Args:
+        undo: closes them again.
 
     Raises:
         InputError: a file or a name. RigError: a device.
     """
     found: list[Source] = []
     for each in streams:
-        found += [each] if isinstance(each, Source) else _of_text(str(each))
-    names = [source.name for source in found]
-    if not names:
+        for source in [each] if isinstance(each, Source) else _of_text(str(each)):
+            undo.callback(source.stream.close)
+            if source.name in {other.name for other in found}:
+                raise InputError("streams", "", source.name, "is the name of two streams")
+            found.append(source)
+    if not found:
         raise InputError("streams", "", None, "names no stream")
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError("streams", "", twice[0], "is the name of two streams")
     return found
 
 
-def _of_text(text: str) -> list[Source]:
-    """Return the streams of a file, or the one that a short form names."""
-    if found := _SHORT.fullmatch(text):
-        name, kind, place = found.groups()
+def _of_text(text: str) -> Iterator[Source]:
+    """Yield the streams of a file, or the one that a short form names."""
+    if short := _SHORT.fullmatch(text):
+        name, kind, place = short.groups()
         if kind == "lsl":
-            return [lsl(place, name)]
+            yield lsl(place, name)
+            return
         device, _, size = place.partition("@")
         width, x, height = (size or "1280x720").partition("x")
         if not (x and width.isdecimal() and height.isdecimal()):
             raise InputError("STREAMS", "", text, "must be usb:DEVICE@WIDTHxHEIGHT")
-        return [usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))]
+        yield usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))
+        return
     path = Path(text)
     data = parse_yaml(read_text(path, "file of streams"), path)
-    if "driver" not in data and "extends" not in data and "devices" not in data:
-        file = validate(StreamsFile, data, path)
-        flat = PlateFrame.taught(_FLAT)
-        return [_driven(name, stream, flat) for name, stream in file.streams.items()]
-    return _of_rig(path)
+    if "driver" in data or "extends" in data or "devices" in data:
+        yield from _of_rig(path)
+        return
+    file = validate(StreamsFile, data, path)
+    for name, stream in file.streams.items():
+        yield _driven(name, stream, PlateFrame.taught(_FLAT))
 
 
-def _of_rig(path: Path) -> list[Source]:
-    """Return cameras and further streams of a rig file; neither arm nor gripper."""
+def _of_rig(path: Path) -> Iterator[Source]:
+    """Yield cameras and further streams of a rig file; neither arm nor gripper."""
     rig, _ = load_rig_file(path)
-    if rig.driver != "devices" or rig.devices is None:
-        raise InputError(path, "driver", rig.driver, "must be devices: only those can be recorded")
-    found, frame = [], taught_frame(rig)
     devices = rig.devices
+    if rig.driver != "devices" or devices is None:
+        raise InputError(path, "driver", rig.driver, "must be devices: only those can be recorded")
     if "events" in rig.cameras:
-        camera = devices.event_camera_driver.build(devices.event_camera)
-        record = StreamRecord(
-            kind=EVENTS_KIND,
-            rows=0,
-            size_px=(camera.width, camera.height),
-            timing=StreamTiming(grade="device time stamps"),
-        )
-        stream = DeviceStream(EVENTS_KIND, camera, record)
-        locks = devices.event_camera_driver.locks(devices.event_camera)
-        found.append(Source(stream, READS, locks=locks))
-    for name, stream_settings in rig.streams.items():
-        found.append(_driven(name, stream_settings, frame))
-    return found
+        driver = devices.event_camera_driver
+        camera = driver.build(devices.event_camera)
+        size = camera.width, camera.height
+        about = StreamRecord(kind=EVENTS_KIND, rows=0, size_px=size, timing=StreamTiming())
+        stream = DeviceStream(EVENTS_KIND, camera, about)
+        yield Source(stream, READS, locks=driver.locks(devices.event_camera))
+    if "frames" in rig.cameras:
+        yield _first_frames(path, rig, devices)
+    for name, settings in rig.streams.items():
+        yield _driven(name, settings, taught_frame(rig))
+
+
+def _first_frames(path: Path, rig: RigFile, devices: DeviceSettings) -> Source:
+    """Open the first frame camera of a rig file, which has to run by itself."""
+    grade = rig.timing.frames
+    if grade in WIRED:
+        text = "needs the sync box; without an arm write host arrival or device time stamps"
+        raise InputError(path, "timing.frames", grade, text)
+    driver, spec = devices.frame_camera_driver, rig.frame_camera
+    camera = driver.build(devices.frame_camera, spec.scale_px_per_mm)
+    size = spec.width_px, spec.height_px
+    camera.set_region(*size)
+    clock = rig.timing.frame_camera.model_dump()
+    about = StreamRecord(
+        kind=FRAMES_KIND,
+        rows=0,
+        size_px=size,
+        px_per_mm=spec.scale_px_per_mm,
+        mid_exposure_ns=camera.mid_exposure_ns,
+        timing=StreamTiming(**clock, grade=grade, delay=rig.timing.frame_delay),
+    )
+    stream = DeviceStream(FRAMES_KIND, camera, about)
+    return Source(stream, locks=driver.locks(devices.frame_camera))
 
 
 def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
