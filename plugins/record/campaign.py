@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
 from pathlib import Path
-from typing import Any
 
-from sliplab.plugins.record.sources import Source
 from sliplab.protocols.adapter import Adapter, load_adapter
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml, read_text, validate
-from sliplab.storage.files import json_text
 from sliplab.storage.process import now
 from sliplab.storage.streams import EVENTS_KIND, Json
 from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo
@@ -20,9 +17,7 @@ _MAY = ("title", "about", "experiment", "classes", "split", "analysis")
 _RIG = "# Recorded: there is no rig file.\nimported: record\n"
 
 
-def join(
-    campaign: Campaign, analysis: Path | None, simulated: bool, sources: Sequence[Source]
-) -> str:
+def join(campaign: Campaign, analysis: Path | None, simulated: bool) -> str:
     """Describe a new campaign, or check that the one there was recorded; return its experiment.
 
     Args:
@@ -57,18 +52,20 @@ def join(
 
 def _text(name: str, analysis: Path | None, simulated: bool) -> str:
     """Return the adapter of recorded trials: only its analysis and split mean something."""
-    given: dict[str, Any] = {}
+    text, given = "", {}
     if analysis is not None:
-        given = dict(parse_yaml(read_text(analysis, "analysis file"), analysis))
+        text = read_text(analysis, "analysis file")
+        given = parse_yaml(text, analysis)
         if wrong := [key for key in given if key not in _MAY]:
             raise InputError(analysis, wrong[0], None, f"must be one of {', '.join(_MAY)}")
-    data = {
+    head = {
         "adapter": 1,
         "name": name,
-        "experiment": "kinematic",
         "simulated": simulated,
         "trials": {"files": "*"},
         "streams": {EVENTS_KIND: {"format": "dsec"}},
-        **given,
     }
-    return "# Recorded by `sliplab record`.\n" + json_text(data)
+    if "experiment" not in given:
+        head["experiment"] = "kinematic"
+    lines = [f"{key}: {json.dumps(value)}" for key, value in head.items()]
+    return "\n".join(["# Recorded by `sliplab record`.", *lines, text])

@@ -108,7 +108,7 @@ class Recorder:
                 for name, what in source.locks.items()
             }
             undo.enter_context(locked(locks, self._store))
-            self._experiment = join(self.campaign, self._analysis, self._simulated, self.sources)
+            self._experiment = join(self.campaign, self._analysis, self._simulated)
             self.salvaged = salvage_campaign(self.campaign)
             for source in self.sources:
                 source.stream.connect()

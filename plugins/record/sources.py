@@ -256,12 +256,15 @@ def usb_camera(
     return declared(name, about)
 
 
-def columns(name: str, place: str, units: Mapping[str, str], **settings: Any) -> Source:
+def columns(
+    name: str, place: str, units: Mapping[str, str], delay_ms: float = 50.0, **settings: Any
+) -> Source:
     """Declare a stream of numbers from a serial port or a socket.
 
     Args:
         place: ``/dev/ttyACM0``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
         units: of each column by its name, in their order.
+        delay_ms: longest time from a reading to its arrival here.
         settings: see `plugins.record.columns.ColumnsSettings`.
 
     Raises:
@@ -269,7 +272,8 @@ def columns(name: str, place: str, units: Mapping[str, str], **settings: Any) ->
     """
     grade = "host arrival" if settings.get("time_column") is None else "host time"
     about = {"driver": "columns", "place": place, "columns": dict(units), **settings}
-    return declared(name, {"kind": "table", "timing": {"grade": grade}, "device": about})
+    timing = {"grade": grade, "delay": {"shortest_us": 0, "longest_us": delay_ms * 1000}}
+    return declared(name, {"kind": "table", "timing": timing, "device": about})
 
 
 def lsl(stream: str, name: str | None = None, **settings: Any) -> Source:

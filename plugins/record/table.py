@@ -16,7 +16,7 @@ from sliplab.storage.streams import READS, SCALAR, Chunk, Column, ScalarChunk, S
 _COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
 _ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
-CLOCK = StreamKind("clock", READS.columns | {"error": _ERROR})
+CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
 """Readings of a stream's clock: its time, and between which two times of the host that was."""
 
 

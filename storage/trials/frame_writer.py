@@ -86,7 +86,7 @@ class FrameWriter:
             chunk = self._encoding.popleft()
             self._streams.add(FRAMES.name, chunk)
             self._images += len(chunk)
-            self._crc = zlib.crc32(np.ascontiguousarray(chunk.images), self._crc)
+            self._crc = zlib.crc32(np.ascontiguousarray(chunk.images).data, self._crc)
 
     def settle(self) -> None:
         """Write what is being encoded, with its rows, before the HDF5 file is closed."""

@@ -195,7 +195,7 @@ class _Rows:
             held = self._held[self._waiting : self._waiting + len(part)]
             held[:] = part
             if self.crc is not None:
-                self.crc = zlib.crc32(held, self.crc)
+                self.crc = zlib.crc32(held.data, self.crc)
             self._waiting += len(part)
             if len(part) == room:
                 self.flush()

@@ -108,7 +108,7 @@ def _matching(counts: Sequence[Sequence[int]], read: Callable[[int, int], Iterab
     for index, (rows, stated) in enumerate(counts):
         try:
             for block in read(done, rows):
-                crc = zlib.crc32(np.ascontiguousarray(block), crc)
+                crc = zlib.crc32(np.ascontiguousarray(block).data, crc)
         except Exception as error:  # of HDF5 or FFmpeg, about what may have any damage
             if own_fault(error):
                 raise
