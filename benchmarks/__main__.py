@@ -27,6 +27,7 @@ NAMES = (
     "orchestration",
     "page",
     "acquisition",
+    "record",
     "scale",
     "exchange_memory",
     "fewer",

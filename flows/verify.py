@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.storage.trials.lock import Locked
+from sliplab.storage.trials.prefix_journal import JOURNAL
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import (
     DAMAGED,
@@ -60,6 +65,7 @@ def verify(place: str, quarantine: bool = False) -> Verification:
     if is_url(place):
         return _verify_pushed(place, quarantine)
     opened = Store.open(Path(place))
+    _salvage(opened)
     total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     mended: list[Path] = []
     with console.bar("verify (trials)", total) as bar:
@@ -87,6 +93,19 @@ def verify(place: str, quarantine: bool = False) -> Verification:
     if failing := failed_gates(opened):
         result["failed_gates"] = failing
     return result
+
+
+def _salvage(store: Store) -> None:
+    """Let plug-ins keep what verifies of trials whose program was killed, if no other one writes."""
+    folders = (path for each in store.campaigns() for path in each.folders("incoming"))
+    if not any((path / JOURNAL).exists() for path in folders):
+        return
+    from sliplab.flows.collecting.requests import store_lock
+
+    with suppress(Locked, RigError), store_lock(store):
+        for salvage in plugins().hooks("salvage"):
+            for trial in salvage(store):
+                console.say(f"kept what verifies of the unfinished trial {trial}")
 
 
 def _verify_pushed(url: str, quarantine: bool) -> Verification:

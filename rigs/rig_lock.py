@@ -13,7 +13,7 @@ import fcntl
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def lock_names(file: RigFile) -> dict[str, str]:
     if file.simulated:
         return {}
     return {
-        f"{_plain(name)}.lock": f"{what} (rig {file.name})"
+        lock_file(name): f"{what} (rig {file.name})"
         for _, driver, settings in file.drivers()
         for name, what in driver.locks(settings).items()
     }
@@ -41,22 +41,29 @@ def lock_names(file: RigFile) -> dict[str, str]:
 
 @contextmanager
 def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
-    """Lock a rig for this program while the block runs.
+    """Lock a rig for this program while the block runs; see `locked`."""
+    with locked(lock_names(file), store):
+        yield
+
+
+@contextmanager
+def locked(devices: Mapping[str, str], store: Path | None = None) -> Iterator[None]:
+    """Lock devices for this program while the block runs.
 
     Args:
+        devices: their descriptions by lock file name.
         store: the store that is written, shown to other programs that are refused.
 
     Raises:
         Locked: another program has the lock; the message names it, its user and its start time.
         RigError: the lock files cannot be created.
     """
-    names = lock_names(file)
     with ExitStack() as locks:
-        if names:
+        if devices:
             about = {} if store is None else {"store": str(store.absolute())}
             try:
                 folder = _folder(locks)
-                for name, what in names.items():
+                for name, what in devices.items():
                     locks.enter_context(exclusive(folder / name, what, mode=0o666, about=about))
             except (OSError, NoLocks) as error:
                 raise RigError(
@@ -82,6 +89,11 @@ def _folder(locks: ExitStack) -> Path:
         raise OSError(errno.EPERM, text, str(folder))
     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from cleaning it up
     return folder
+
+
+def lock_file(name: str) -> str:
+    """Return the name of a device's lock file."""
+    return f"{_plain(name)}.lock"
 
 
 def _plain(name: str) -> str:

@@ -102,6 +102,16 @@ class _StreamSettings(StrictModel):
             raise KeyedError(".kind", kind, text)
         return self
 
+    @rule
+    def _driver_times_so(self) -> Self:
+        driver = self.driver
+        if isinstance(driver, SensorDriver) and driver.grade is not None:
+            grade = driver.grade(getattr(self, "device", None))
+            if self.timing.grade != grade:
+                text = f"must be {grade}, as the driver {driver.name} times its rows here"
+                raise KeyedError(".timing.grade", self.timing.grade, text)
+        return self
+
     @property
     def driver(self) -> Driver[Any] | None:
         """The driver of the device; None on a mock rig."""

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
         verify,
     )
     from sliplab.flows.collecting.requests import CampaignStopped
+    from sliplab.plugins.record.recorder import record
+    from sliplab.plugins.record.sources import columns, lsl, push, usb_camera
     from sliplab.protocols.errors import InputError
     from sliplab.protocols.plan import Plan
     from sliplab.storage.errors import StoreError
@@ -66,16 +68,26 @@ __all__ = [
     "__version__",
     "check",
     "collect",
+    "columns",
     "export",
     "import_data",
     "load_model",
+    "lsl",
     "open_store",
     "plan",
+    "push",
+    "record",
+    "usb_camera",
     "verify",
 ]
 __version__: str
 
 _ELSEWHERE = {
+    "columns": "sliplab.plugins.record.sources",
+    "lsl": "sliplab.plugins.record.sources",
+    "push": "sliplab.plugins.record.sources",
+    "record": "sliplab.plugins.record.recorder",
+    "usb_camera": "sliplab.plugins.record.sources",
     "CampaignStopped": "sliplab.flows.collecting.requests",
     "InputError": "sliplab.protocols.errors",
     "Plan": "sliplab.protocols.plan",

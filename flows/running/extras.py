@@ -27,6 +27,7 @@ EXTRAS = {
     "onnx": ("onnx", "onnxruntime"),
     "publish": ("mcap", "zstandard", "lz4"),
     "formats": ("faery", "rosbags"),
+    "lsl": ("pylsl",),
     "xarray": ("xarray",),
 }
 """Modules that each extra installs."""

@@ -19,7 +19,7 @@ from sliplab.rigs.core.sections import RigSection, SimulatedStream
 
 if TYPE_CHECKING:
     from sliplab.protocols.key_errors import KeyedError
-    from sliplab.protocols.timing import Code, FrameGrade
+    from sliplab.protocols.timing import Code, FrameGrade, StreamGrade
     from sliplab.rigs.core.capabilities import (
         Arm,
         EventCamera,
@@ -344,6 +344,8 @@ class SensorDriver(Driver[SettingsT]):
     """Make the device, not connected yet; a `ScalarSensor` where `stream` is not set."""
     stream: StreamKind | None = None
     """The kind of its stream; None for readings of one quantity."""
+    grade: Callable[[SettingsT], StreamGrade] | None = None
+    """Return the only grade of its times; None: as the rig file says."""
 
     @property
     def sends(self) -> str:

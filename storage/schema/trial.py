@@ -228,6 +228,16 @@ class Given(Part):
     """Classes other than those of slip."""
 
 
+class Mark(Part):
+    """A moment that a program or a person marked during a recording."""
+
+    name: str
+    t_ns: Int
+    """On the trial's time line."""
+    uncertainty_ns: Number | None = None
+    """Bound of its error; null where unknown."""
+
+
 class Lost(Part):
     """The part of a damaged file that was not read: the trial is what stands whole before it."""
 
@@ -260,6 +270,8 @@ class Imported(Part):
     """Start and end of the recording on the time line, where its steps do not say."""
     given: Given | None = None
     """Labels that came with it."""
+    marks: tuple[Mark, ...] = ()
+    """Marks of a recording, in order of time; written only where there are any."""
     lost: Lost | None = None
     """What is missing, of a trial that was salvaged from a damaged file."""
     dropped: dict[str, Int] = Field(default_factory=dict)

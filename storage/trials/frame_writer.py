@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import threading
+import zlib
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
@@ -37,6 +38,7 @@ class FrameWriter:
         video: path of the video.
         spool: path of a file in which raw frames wait until `seal`; None to encode them at once.
         size_px: width and height of the frames; that of the first ones if left out.
+        guarded: write them at once, for a program that may be killed, and compute a checksum.
     """
 
     def __init__(
@@ -46,8 +48,11 @@ class FrameWriter:
         spool: Path | None,
         rate_hz: int,
         size_px: tuple[int, int] | None = None,
+        guarded: bool = False,
     ) -> None:
         self._streams, self._path, self._rate_hz = streams, video, rate_hz
+        self._guarded, self._images, self._crc = guarded, 0, 0
+        self._encoding: deque[FrameChunk] = deque()
         self._size_px, self._raw = size_px, spool
         self._spool: Spool | None = None
         self._video: VideoWriter | None = None
@@ -56,7 +61,8 @@ class FrameWriter:
         """Append frames, or the tracks in place of them, and their times."""
         if not len(chunk):
             return
-        self._streams.add(FRAMES.name, chunk)
+        if not self._guarded or chunk.markers_px is not None:
+            self._streams.add(FRAMES.name, chunk)
         if chunk.markers_px is not None:
             self._streams.add_tracks(chunk)
             return
@@ -67,8 +73,30 @@ class FrameWriter:
             self._spool.write(chunk.images)
         else:
             if self._video is None:
-                self._video = VideoWriter(self._path, *self._size_px, self._rate_hz)
+                size, guarded = self._size_px, self._guarded
+                self._video = VideoWriter(self._path, *size, self._rate_hz, guarded=guarded)
             self._video.write(chunk.images)
+            if self._guarded:
+                self._encoding.append(chunk)
+                self._add_rows(self._video.muxed - 1)  # the last one waits for the next
+
+    def _add_rows(self, written: int) -> None:
+        """Add the rows of frames that are in the video."""
+        while self._encoding and self._images + len(self._encoding[0]) <= written:
+            chunk = self._encoding.popleft()
+            self._streams.add(FRAMES.name, chunk)
+            self._images += len(chunk)
+            self._crc = zlib.crc32(np.ascontiguousarray(chunk.images).data, self._crc)
+
+    def settle(self) -> None:
+        """Write what is being encoded, with its rows, before the HDF5 file is closed."""
+        if self._guarded and self._video is not None:
+            self._video.close()
+            self._add_rows(self._video.frames)
+
+    def mark(self) -> list[int]:
+        """Return how many images were written, and their CRC-32."""
+        return [self._images, self._crc]
 
     def seal(self) -> None:
         """Finish the video."""

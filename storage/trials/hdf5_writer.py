@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import os
 import re
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from io import BytesIO
@@ -45,6 +47,7 @@ from sliplab.storage.streams import (
     Column,
     EventChunk,
     FrameChunk,
+    Json,
     StreamKind,
 )
 
@@ -166,7 +169,10 @@ class _Rows:
 
     Attributes:
         shape: of one row.
+        crc: CRC-32 of all rows so far; None where it is not computed.
     """
+
+    crc: int | None = None
 
     def __init__(self, file: Any, name: str) -> None:
         self._data = h5py.h5d.open(file.id, name.encode())
@@ -183,9 +189,13 @@ class _Rows:
     def append(self, values: Array) -> None:
         """Add rows, (k, *shape)."""
         while len(values):
-            room = len(self._held) - self._waiting
+            # up to the end of a chunk, also where a mark has written a part of one
+            room = len(self._held) - self.count % len(self._held)
             part = values[:room]
-            self._held[self._waiting : self._waiting + len(part)] = part
+            held = self._held[self._waiting : self._waiting + len(part)]
+            held[:] = part
+            if self.crc is not None:
+                self.crc = zlib.crc32(held.data, self.crc)
             self._waiting += len(part)
             if len(part) == room:
                 self.flush()
@@ -218,10 +228,33 @@ class _Rows:
         return column
 
 
-class StreamFile:
-    """A trial's HDF5 file while it is written; append only."""
+def cut(path: Path, state: Json) -> None:
+    """Cut a guarded file to the rows of one of its marks, and finish it.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        state: what `StreamFile.mark` returned.
+    """
+    rows = {name: count for name, (count, _) in state["columns"].items()}
+    with h5py.File(path, "r+", libver="latest") as file:
+        for name, count in rows.items():
+            file[name].resize(count, axis=0)
+        if rows[INDEX] < INDEXED_MS:  # as `StreamFile.finish`
+            file[INDEX].resize(rows[INDEX] + 1, axis=0)
+            file[INDEX][-1] = rows[TIMES]
+        else:
+            file.attrs["format"] = INDEX_CUT_FORMAT
+        file[OFFSET][()] = state["offset_us"]
+
+
+class StreamFile:
+    """A trial's HDF5 file while it is written; append only.
+
+    Args:
+        expected: empty chunks of every stream that may come, by device. The file is then readable
+            up to its last `mark` whenever the program is killed; nothing else can be added.
+    """
+
+    def __init__(self, path: Path, expected: Mapping[str, Iterable[Chunk]] | None = None) -> None:
         self.path = path
         path.write_bytes(blank())
         self._file = h5py.File(path, "r+", libver="latest", rdcc_nbytes=CACHE_BYTES)
@@ -231,6 +264,29 @@ class StreamFile:
         self._wide = False
         self._kinds: dict[str, StreamKind] = {}
         self._columns = {name: _Rows(self._file, name) for name in (*COLUMNS, INDEX)}
+        if expected is not None:
+            self._guard(expected)
+
+    def _guard(self, expected: Mapping[str, Iterable[Chunk]]) -> None:
+        """Make all columns, and let HDF5 write in an order in which the file is always readable."""
+        self._columns[TIMES] = self._columns[TIMES].widened(self._file, TIMES, WIDE)
+        self._wide = True
+        for device, chunks in expected.items():
+            for chunk in chunks:
+                path = self._path(device, chunk.KIND)
+                if f"{path}/t" not in self._columns:
+                    self._make(path, chunk)
+        for column in self._columns.values():
+            column.crc = 0
+        self._file.swmr_mode = True
+
+    def mark(self) -> Json:
+        """Write all rows; return how many each column has, and their CRC-32."""
+        for column in self._columns.values():
+            column.flush()
+        self._file.flush()
+        columns = {name: [column.count, column.crc] for name, column in self._columns.items()}
+        return {"offset_us": self._offset or 0, "columns": columns}
 
     @property
     def counts(self) -> dict[str, int]:
@@ -246,14 +302,8 @@ class StreamFile:
             ValueError: the name is not a small identifier, the stream is of another kind, or times
                 of events decrease.
         """
-        path = _GROUP_OF.get((device, chunk.KIND.name))
         kind = chunk.KIND
-        if path is None:
-            path = f"{STREAM_GROUP}/{device}"
-            if not STREAM_NAME.fullmatch(device):
-                raise ValueError(f"stream '{device}': a name must match {STREAM_NAME.pattern}")
-            if (known := self._kinds.setdefault(device, kind).name) != kind.name:
-                raise ValueError(f"stream '{device}': is of kind '{known}', not '{kind.name}'")
+        path = self._path(device, kind)
         if not len(chunk):
             return
         if isinstance(chunk, EventChunk):
@@ -262,6 +312,17 @@ class StreamFile:
             self._make(path, chunk)
         for part, column in kind.columns.items():
             self._columns[f"{path}/{part}"].append(getattr(chunk, column.field))
+
+    def _path(self, device: str, kind: StreamKind) -> str:
+        """Return the group of a device's stream. Raises ValueError as `add`."""
+        path = _GROUP_OF.get((device, kind.name))
+        if path is None:
+            path = f"{STREAM_GROUP}/{device}"
+            if not STREAM_NAME.fullmatch(device):
+                raise ValueError(f"stream '{device}': a name must match {STREAM_NAME.pattern}")
+            if (known := self._kinds.setdefault(device, kind).name) != kind.name:
+                raise ValueError(f"stream '{device}': is of kind '{known}', not '{kind.name}'")
+        return path
 
     def _make(self, path: str, chunk: Chunk) -> None:
         """Make the columns of a stream."""

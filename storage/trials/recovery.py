@@ -13,6 +13,7 @@ from sliplab.storage.errors import own_fault
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials.checksums import CHECKSUMS, ELSEWHERE, RECORD, read_sums
+from sliplab.storage.trials.prefix_journal import drop_journal
 from sliplab.storage.trials.store import CAUSE, Campaign
 from sliplab.storage.trials.verify import content_problems, verify_trial
 from sliplab.storage.trials.writer import finish_folder, make_visible
@@ -36,6 +37,7 @@ def _commit(campaign: Campaign, folder: Path) -> bool:
         return False
     if (folder / CAUSE).exists() or (folder / ELSEWHERE).exists():
         return False
+    drop_journal(folder)
     if not _has_checksums(folder):
         if _problems(lambda: content_problems(folder, TrialRecord.load(folder / RECORD))):
             return False

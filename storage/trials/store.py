@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NotRequired, TypedDict, cast
@@ -42,7 +42,7 @@ from sliplab.storage.files import (
 )
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.trial import Provenance
-from sliplab.storage.streams import Json
+from sliplab.storage.streams import Chunk, Json
 from sliplab.storage.trials.checksums import CHECKSUMS, PROVENANCE, Fetch, incomplete, write_sums
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.writer import TrialWriter
@@ -258,14 +258,20 @@ class Campaign:
         return Recording(path, self.sync_file(trial_id), self.fetch)
 
     def begin(
-        self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
+        self,
+        trial_id: str,
+        frame_px: tuple[int, int] | None,
+        rate_hz: int,
+        *,
+        spool: bool = False,
+        expected: Mapping[str, Sequence[Chunk]] | None = None,
     ) -> TrialWriter:
         """Begin to write a trial; an interrupted attempt under its id is quarantined first.
 
         Call it in a function that is `interrupts.uninterrupted` until the writer has ended.
         """
         incoming, target = self.places(trial_id)
-        return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool)
+        return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool, expected=expected)
 
     def places(self, trial_id: str) -> tuple[Path, Path]:
         """Return a trial's folder while it is written, and once it is committed; both are free.

@@ -14,6 +14,7 @@ import queue
 import threading
 from collections.abc import Iterator
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ else:
     av = Later("av")
 
 CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
+_AT_ONCE = {"cluster_time_limit": "1", "flush_packets": "1"}
+"""A cluster a frame: Matroska's writer holds a cluster back until the next one begins."""
 _QUEUE_FRAMES = 32
 _PUT_TIMEOUT_S = 60.0
 
@@ -41,15 +44,25 @@ class VideoWriter:
     """Writes grey frames of one size; `close` returns when every frame is in the file.
 
     The file does not depend on the number of threads.
+
+    Args:
+        guarded: write each frame when the next one comes, for a program that may be killed.
     """
 
-    def __init__(self, path: Path, width: int, height: int, rate_hz: int, threads: int = 2) -> None:
+    def __init__(
+        self,
+        path: Path,
+        width: int,
+        height: int,
+        rate_hz: int,
+        threads: int = 2,
+        guarded: bool = False,
+    ) -> None:
         self.width, self.height = width, height
         self.frames = 0
         self._time_base = Fraction(1, rate_hz)
-        self._container = av.open(
-            video_url(path), "w", format="matroska", options={"fflags": "+bitexact"}
-        )
+        options = {"fflags": "+bitexact"} | (_AT_ONCE if guarded else {})
+        self._container = av.open(video_url(path), "w", format="matroska", options=options)
         self._stream = self._container.add_stream("ffv1", rate=rate_hz, options=CODEC_OPTIONS)
         encoders = [self._stream.codec_context]
         encoders += [av.CodecContext.create("ffv1", "w") for _ in range(threads - 1)]
@@ -74,6 +87,11 @@ class VideoWriter:
         ]
         for thread in self._threads:
             thread.start()
+
+    @property
+    def muxed(self) -> int:
+        """Frames that were handed to the file."""
+        return self._muxed
 
     def write(self, images: U8) -> None:
         """Append frames of shape (n, height, width), grey, uint8.
@@ -198,6 +216,21 @@ class FrameReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def cut_video(path: Path, frames: int, to: Path) -> None:
+    """Copy the first frames of a video, as they are encoded, to another file."""
+    options = {"fflags": "+bitexact"}
+    with (
+        av.open(video_url(path)) as source,
+        av.open(video_url(to), "w", format="matroska", options=options) as target,
+    ):
+        stream = source.streams.video[0]
+        copied = target.add_stream_from_template(stream)
+        packets = (packet for packet in source.demux(stream) if packet.size)
+        for packet in islice(packets, frames):
+            packet.stream = copied
+            target.mux(packet)
 
 
 def count_frames(path: Path) -> int:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ from sliplab.storage.trials.checksums import (
 )
 from sliplab.storage.trials.frame_writer import FrameWriter
 from sliplab.storage.trials.hdf5_writer import OWN_DEVICES, STREAM_NAME, StreamFile
+from sliplab.storage.trials.prefix_journal import Journal, drop_journal
 
 
 def data_files(folder: Path) -> list[str]:
@@ -69,6 +72,9 @@ class TrialWriter:
             be a video shows with the first frame: a camera may return tracks instead.
         spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
             encode as fast as their cameras deliver.
+        expected: empty chunks of every stream that may come, by device; nothing else can be added.
+            What was written before the last `mark` can then be kept after a crash
+            (`storage.trials.prefix`), but for spooled frames.
     """
 
     def __init__(
@@ -79,15 +85,22 @@ class TrialWriter:
         rate_hz: int,
         *,
         spool: bool = False,
+        expected: Mapping[str, Sequence[Chunk]] | None = None,
     ) -> None:
         self.folder, self.target = folder, target
         folder.mkdir(parents=True)
         self._rate_hz, self._spool = rate_hz, spool
-        streams = StreamFile(folder / DATA)
+        own, cameras = _split(expected)
+        streams = StreamFile(folder / DATA, own)
         raw = folder / SPOOL if spool else None
-        frames = FrameWriter(streams, folder / FRAMES, raw, rate_hz, frame_px)
+        guarded = expected is not None
+        frames = FrameWriter(streams, folder / FRAMES, raw, rate_hz, frame_px, guarded)
         self._files = _Files(streams, None if frame_px is None else frames)
-        self._further: dict[str, tuple[str, _Files]] = {}
+        self._further: dict[str, tuple[str, _Files]] = {
+            name: (chunks[0].KIND.camera, self._camera_files(name, chunks))
+            for name, chunks in cameras.items()
+        }
+        self._journal = Journal(folder) if guarded else None
         self._sealed = False
 
     @property
@@ -115,12 +128,24 @@ class TrialWriter:
             raise ValueError(f"stream '{device}': is of kind '{known}', not '{camera}'")
         files.add(camera, chunk)
 
-    def _camera_files(self, name: str) -> _Files:
+    def _camera_files(self, name: str, expected: Sequence[Chunk] | None = None) -> _Files:
         """Make the files of a further camera."""
         data, video, raw = (self.folder / stream_file(name, end) for end in ("h5", "mkv", "raw"))
-        streams = StreamFile(data)
+        guarded = None if expected is None else {expected[0].KIND.camera: expected}
+        streams = StreamFile(data, guarded)
         spool = raw if self._spool else None
-        return _Files(streams, FrameWriter(streams, video, spool, self._rate_hz))
+        frames = FrameWriter(streams, video, spool, self._rate_hz, guarded=guarded is not None)
+        return _Files(streams, frames)
+
+    def mark(self) -> None:
+        """Note what was written so far, of a trial with `expected` streams, once it is on the disk.
+
+        Raises:
+            OSError: the disk refused earlier rows.
+        """
+        assert self._journal is not None
+        files = {"": self._files, **{name: files for name, (_, files) in self._further.items()}}
+        self._journal.add({name: each.mark() for name, each in files.items()})
 
     def seal(self) -> Path:
         """Finish data and video files, so that they can be read before the commit.
@@ -131,6 +156,8 @@ class TrialWriter:
         if self._sealed:
             return self.folder
         self._sealed = True
+        if self._journal is not None:
+            self._journal.close()
         self._files.seal()
         for _, files in self._further.values():
             files.seal()
@@ -171,6 +198,7 @@ class TrialWriter:
             sync_file(self.folder / name)
         write_json_aside(self.folder / PROVENANCE, provenance.to_json())
         write_json_aside(self.folder / RECORD, record.to_json())
+        drop_journal(self.folder)
         finish_folder(self.folder, cause)
 
     def abandon(self) -> None:
@@ -178,6 +206,8 @@ class TrialWriter:
         if not self._sealed:
             self._sealed = True
             try:
+                if self._journal is not None:
+                    self._journal.close()
                 self._files.abandon()
             finally:
                 for _, files in self._further.values():
@@ -188,6 +218,20 @@ class TrialWriter:
         """Close open files and delete the folder; for motions that are no trial."""
         self.abandon()
         shutil.rmtree(self.folder)
+
+
+def _split(
+    expected: Mapping[str, Sequence[Chunk]] | None,
+) -> tuple[Mapping[str, Sequence[Chunk]] | None, Mapping[str, Sequence[Chunk]]]:
+    """Return the expected streams of a trial's own file, and those of further cameras."""
+    if expected is None:
+        return None, {}
+    cameras = {
+        name: chunks
+        for name, chunks in expected.items()
+        if chunks[0].KIND.camera and name not in OWN_DEVICES
+    }
+    return {name: each for name, each in expected.items() if name not in cameras}, cameras
 
 
 @dataclass
@@ -208,8 +252,15 @@ class _Files:
         elif self.frames is not None:
             self.frames.add(chunk)
 
+    def mark(self) -> Json:
+        """Write what waits, and return what the files hold."""
+        images = [0, 0] if self.frames is None else self.frames.mark()
+        return {**self.streams.mark(), "images": images, "host_ns": time.monotonic_ns()}
+
     def seal(self) -> None:
         """Finish the files."""
+        if self.frames is not None:
+            self.frames.settle()
         self.streams.finish()
         if self.frames is not None:
             self.frames.seal()

@@ -19,7 +19,8 @@ from tests.flows.older import older_store
 
 NOTEBOOK = ROOT / "docs" / "howto" / "from-a-notebook.md"
 READ_WITHOUT = ROOT / "docs" / "howto" / "read-without-sliplab.md"
-GUIDES = sorted(set((ROOT / "docs" / "howto").glob("[a-z]*-*.md")) - {NOTEBOOK})
+INDEX = ROOT / "docs" / "howto" / "index.md"
+GUIDES = sorted(set((ROOT / "docs" / "howto").glob("[a-z]*.md")) - {NOTEBOOK, INDEX})
 WHOLE = ("write-a-driver", "add-an-analysis-step", "import-labelled-data")
 """Guides that install a package, or go through all steps."""
 

@@ -1,0 +1,99 @@
+"""Clocks of a recorded trial: each stream's map onto the host's clock, or why there is none.
+
+The host's clock takes the place of the sync box, so the maps are fitted as those of a rig are
+(`analysis.clocks.synchronise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from sliplab.analysis.clocks.synchronise import (
+    ClockInput,
+    clocks_in,
+    streams_of,
+    synchronise,
+)
+from sliplab.plugins.record.sources import CLOCK_STREAM, FIRST_CAMERAS, HOST, READS, SourceAbout
+from sliplab.plugins.record.table import CLOCK
+from sliplab.protocols.timing import StreamTiming, Timing
+from sliplab.storage.clockmap import IDENTITY
+from sliplab.storage.schema.trial import DeviceRecord
+from sliplab.storage.streams import ClockReads
+from sliplab.storage.trials.checksums import DATA
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """Maps onto the host's clock by stream, and why others have none."""
+
+    found: dict[str, DeviceRecord] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+def fit_clocks(
+    folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]
+) -> Clocks:
+    """Fit the clocks of a sealed trial.
+
+    Args:
+        sources: streams that have rows.
+        span_ns: begin and end of the trial on the host's clock.
+    """
+    result = Clocks()
+    timed = {}
+    for name, source in sources.items():
+        if source.clock == HOST:
+            error = source.uncertainty_ns
+            result.found[name] = DeviceRecord(grade=HOST, map=IDENTITY, uncertainty_ns=error)
+        else:
+            timed[name] = source
+    if not timed:
+        return result
+    by_timing = {
+        name: each.record
+        for name, each in timed.items()
+        if each.clock != READS and name not in FIRST_CAMERAS
+    }
+    inputs, errors = clocks_in(folder, by_timing), {}
+    with StreamReader(folder / DATA) as reader:
+        for name, source in timed.items():
+            if source.clock == READS:
+                timing = source.record.timing or StreamTiming()
+                how = timing.model_copy(update={"grade": "device time stamps"})
+                reads, errors[name] = _reads(reader, name)
+                inputs[name] = ClockInput(how, reads=reads)
+            elif name in FIRST_CAMERAS:
+                mid_ns = source.record.mid_exposure_ns or 0
+                reads = reader.clock_reads("frame_camera_reads")
+                inputs[name] = ClockInput(source.record.timing, reads=reads, mid_exposure_ns=mid_ns)
+        streams = streams_of(reader, None, inputs)
+    host = np.array([span_ns[0], sum(span_ns) // 2, span_ns[1]], np.int64)
+    streams = replace(streams, named=inputs, box_reads=ClockReads(host, host, host))
+    fitted = synchronise(streams, Timing(arm="host time"), 1, with_events=False)
+    for name in timed:
+        if name not in fitted.devices:
+            result.refused[name] = fitted.refused[name]
+            continue
+        record, error = fitted.devices[name].record(), errors.get(name, 0)
+        bound = (record.uncertainty_ns or 0.0) + error
+        result.found[name] = record.model_copy(update={"uncertainty_ns": bound})
+    return result
+
+
+def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:
+    """Return the readings of a stream's clock, and what else its times may be off, ns.
+
+    Some thousand readings say as much as all.
+    """
+    group = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}"
+    t_ns, before, after, error = (reader.column(f"{group}/{part}") for part in CLOCK.columns)
+    some = slice(None, None, max(1, len(t_ns) // 4000))
+    reads = ClockReads(t_ns[some], (before - error)[some], (after + error)[some])
+    return reads, int(error.max(initial=0))

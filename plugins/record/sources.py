@@ -1,0 +1,405 @@
+"""What is recorded: the streams of a rig file or a file of streams, and those declared in code."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from sliplab.plugins.record.pushed import PushedStream
+from sliplab.plugins.record.table import CLOCK, chunk_type, rows
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.timing import WIRED, StreamTiming
+from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
+from sliplab.rigs.build import driven_stream, taught_frame
+from sliplab.rigs.core.device_stream import DeviceStream
+from sliplab.rigs.core.driver import ForceSensorDriver
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.device_section import DeviceSettings
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.stream_settings import (
+    NAME,
+    RESERVED,
+    Stream,
+    Streams,
+    stream_faults,
+)
+from sliplab.storage.schema.trial import StreamRecord
+from sliplab.storage.streams import (
+    EVENTS_KIND,
+    FRAMES_KIND,
+    SCALAR,
+    WRENCH,
+    Chunk,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    PulseChunk,
+    ScalarChunk,
+    Sink,
+    WrenchChunk,
+)
+
+HOST, READS, TIMING = "host stamps", "clock readings", "timing"
+"""How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
+by the timing that its file says."""
+_SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
+FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
+CLOCK_STREAM = "{}_clock"
+
+
+class StreamsFile(StrictModel):
+    """A file of streams: the section `streams` of a rig file by itself."""
+
+    streams: Streams
+
+    @rule
+    def _complete(self) -> Iterable[KeyedError]:
+        yield from stream_faults(self.streams, "devices", ("devices",))
+
+
+class SourceAbout(BaseModel):
+    """What a trial's record and its clocks need to know of a stream."""
+
+    record: StreamRecord
+    clock: str
+    uncertainty_ns: float | None = None
+    """Of stamps of the host's clock, where it is stated."""
+
+
+@dataclass
+class Source:
+    """A stream that is recorded.
+
+    Attributes:
+        clock: `HOST`, `READS` or `TIMING`.
+        uncertainty_ns: see `SourceAbout`.
+        locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
+        fault: why it has ended within the trial; None while it runs.
+        rows: that came in this trial.
+    """
+
+    stream: DeviceStream
+    clock: str = TIMING
+    uncertainty_ns: float | None = None
+    locks: Mapping[str, str] = field(default_factory=dict)
+    fault: str | None = None
+    rows: int = 0
+    _drained_ns: int = 0
+
+    @property
+    def name(self) -> str:
+        """The stream's name."""
+        return self.stream.name
+
+    @property
+    def device(self) -> Any:
+        """The device, or what takes a program's rows."""
+        return self.stream.device
+
+    @property
+    def about(self) -> SourceAbout:
+        """What a trial's record says of it."""
+        return SourceAbout(
+            record=self.stream.about, clock=self.clock, uncertainty_ns=self.uncertainty_ns
+        )
+
+    def expected(self) -> dict[str, tuple[Chunk, ...]]:
+        """Return empty chunks of what may come, by stream; the device is connected."""
+        clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
+        return {self.name: self._chunks()} | (clock if self.clock == READS else {})
+
+    def _chunks(self) -> tuple[Chunk, ...]:
+        kind, unit = self.stream.about.kind, self.stream.about.unit or ""
+        if kind == EVENTS_KIND:
+            return EventChunk.empty(), PulseChunk.empty()
+        if kind == FRAMES_KIND:
+            return FrameChunk.empty(), ClockReads.empty()
+        if kind == WRENCH.name:
+            return (WrenchChunk.empty(),)
+        if kind == SCALAR.name:
+            return (ScalarChunk.empty(unit),)
+        return (chunk_type(self.device.kind).empty(),)
+
+    def start(self) -> None:
+        """Start streaming. Raises RigError."""
+        self.fault, self.rows = None, 0
+        self.stream.start()
+        self._drained_ns = time.monotonic_ns()
+
+    def drain(self, sink: Sink, last: bool = False) -> None:
+        """Read what has come, and the clock. Raises RigError.
+
+        Args:
+            last: stop, and read what was sent before.
+        """
+        seen = _Newest(sink, self)
+        self.stream.drain(seen)
+        if last:
+            self.stream.finish(seen)
+        now = time.monotonic_ns()
+        if self.clock == READS:
+            sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
+        self._drained_ns = now
+
+    def _clock_reads(self, seen: _Newest, now: int) -> Chunk:
+        """Return readings of the clock since the last call, a chunk of the kind `CLOCK`."""
+        if hasattr(self.device, "clock_reads"):
+            found: Chunk = self.device.clock_reads()
+            return found
+        if seen.newest_us is None:
+            return chunk_type(CLOCK).empty()
+        timing = self.stream.about.timing or StreamTiming()
+        # the newest event came after the call before, and was sent not longer before than its way
+        before = self._drained_ns - round(timing.delay.longest_us * 1000)
+        read = {"t": [seen.newest_us * 1000], "before": [before], "after": [now], "error": [0]}
+        return rows(CLOCK, "", read)
+
+
+class _Newest:
+    """A sink that counts a source's rows, and notes its newest event."""
+
+    def __init__(self, sink: Sink, source: Source) -> None:
+        self._sink, self._source = sink, source
+        self.newest_us: int | None = None
+
+    def add(self, device: str, chunk: Chunk) -> None:
+        if isinstance(chunk, EventChunk) and len(chunk):
+            self.newest_us = int(chunk.t_us[-1])
+        if not isinstance(chunk, (PulseChunk, ClockReads)):
+            self._source.rows += len(chunk)
+        self._sink.add(device, chunk)
+
+
+def push(
+    name: str,
+    columns: Mapping[str, str] | None = None,
+    *,
+    events_px: tuple[int, int] | None = None,
+    frames_px: tuple[int, int] | None = None,
+    clock: str = "host",
+    uncertainty_ms: float | None = None,
+) -> Source:
+    """Declare a stream that the program pushes by `RecordedTrial.push`.
+
+    Args:
+        name: of the stream; ``events`` and ``frames`` are those that the analysis works on.
+        columns: of numbers: the unit of each column by its name.
+        events_px, frames_px: columns and rows of a camera, in place of columns.
+        clock: ``host``: times are of ``time.monotonic_ns()``; ``own``: of a clock of its own, which
+            is bounded by the times at which rows are pushed.
+        uncertainty_ms: bound of the error of times of the host's clock; None where it is unknown.
+
+    Raises:
+        InputError: an argument.
+    """
+    given = [each for each in (columns, events_px, frames_px) if each is not None]
+    if len(given) != 1:
+        raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
+    if clock not in {"host", "own"}:
+        raise InputError(name, "clock", clock, "must be host or own")
+    kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
+    _check_name(name, kind)
+    size = events_px or frames_px
+    device = PushedStream(name, columns, kind, size, clock == "host")
+    told: dict[str, Any] = {"kind": kind or (device.kind.name if device.kind else ""), "rows": 0}
+    if size is not None:
+        told["size_px"] = size
+    if device.unit:
+        told["unit"] = device.unit
+    if kind == FRAMES_KIND:
+        told["mid_exposure_ns"] = 0
+    if clock == "own":
+        grade = "host arrival" if kind == FRAMES_KIND else "host time"
+        told["timing"] = StreamTiming(grade=grade)
+        how = READS if kind == EVENTS_KIND else TIMING
+    else:
+        how = HOST
+    error = None if uncertainty_ms is None else uncertainty_ms * 1e6
+    return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
+
+
+def usb_camera(
+    name: str, device: str, size_px: tuple[int, int], rate_hz: float = 30.0, **settings: Any
+) -> Source:
+    """Declare a USB camera, or a stream that OpenCV opens.
+
+    Args:
+        device: path of the camera, or a URL. settings: see docs/cameras.md.
+
+    Raises:
+        InputError: a setting. RigError: it cannot be opened.
+    """
+    width, height = size_px
+    about = {
+        "kind": FRAMES_KIND,
+        "scale_px_per_mm": 1.0,
+        "region_px": [width, height],
+        "rate_hz": rate_hz,
+        "timing": {"grade": "host arrival"},
+        "device": {
+            "driver": "uvc",
+            "device": device,
+            "width_px": width,
+            "height_px": height,
+            "rate_hz": rate_hz,
+            **settings,
+        },
+    }
+    return declared(name, about)
+
+
+def columns(
+    name: str, place: str, units: Mapping[str, str], delay_ms: float = 50.0, **settings: Any
+) -> Source:
+    """Declare a stream of numbers from a serial port or a socket.
+
+    Args:
+        place: ``/dev/ttyACM0``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
+        units: of each column by its name, in their order.
+        delay_ms: longest time from a reading to its arrival here.
+        settings: see `plugins.record.columns.ColumnsSettings`.
+
+    Raises:
+        InputError: a setting.
+    """
+    grade = "host arrival" if settings.get("time_column") is None else "host time"
+    about = {"driver": "columns", "place": place, "columns": dict(units), **settings}
+    timing = {"grade": grade, "delay": {"shortest_us": 0, "longest_us": delay_ms * 1000}}
+    return declared(name, {"kind": "table", "timing": timing, "device": about})
+
+
+def lsl(stream: str, name: str | None = None, **settings: Any) -> Source:
+    """Declare a stream of the Lab Streaming Layer.
+
+    Args:
+        stream: its name there. name: in the store; made of that by default.
+        settings: `source_id` where several senders have it, `find_s` to wait longer.
+
+    Raises:
+        InputError: a setting.
+    """
+    name = name or re.sub(r"[^a-z0-9_]+", "_", stream.lower()).strip("_")[:24]
+    about = {"driver": "lsl", "name": stream, **settings}
+    return declared(name, {"kind": "table", "timing": {"grade": "host time"}, "device": about})
+
+
+def declared(name: str, about: Mapping[str, Any]) -> Source:
+    """Return a stream as a rig file declares it below `streams`. Raises InputError, RigError."""
+    known = name if name not in FIRST_CAMERAS else "camera"
+    file = validate(StreamsFile, {"streams": {known: dict(about)}}, name)
+    return _driven(name, file.streams[known], PlateFrame.taught(_FLAT))
+
+
+_FLAT = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))
+"""Axes of a plate that nobody taught: forces stay in those of the sensor."""
+
+
+def opened(streams: Iterable[str | Path | Source], undo: ExitStack) -> list[Source]:
+    """Return the streams of files and of code; cameras are open, nothing is connected.
+
+    Args:
+        undo: closes them again.
+
+    Raises:
+        InputError: a file or a name. RigError: a device.
+    """
+    found: list[Source] = []
+    for each in streams:
+        for source in [each] if isinstance(each, Source) else _of_text(str(each)):
+            undo.callback(source.stream.close)
+            if source.name in {other.name for other in found}:
+                raise InputError("streams", "", source.name, "is the name of two streams")
+            found.append(source)
+    if not found:
+        raise InputError("streams", "", None, "names no stream")
+    return found
+
+
+def _of_text(text: str) -> Iterator[Source]:
+    """Yield the streams of a file, or the one that a short form names."""
+    if short := _SHORT.fullmatch(text):
+        name, kind, place = short.groups()
+        if kind == "lsl":
+            yield lsl(place, name)
+            return
+        device, _, size = place.partition("@")
+        width, x, height = (size or "1280x720").partition("x")
+        if not (x and width.isdecimal() and height.isdecimal()):
+            raise InputError("STREAMS", "", text, "must be usb:DEVICE@WIDTHxHEIGHT")
+        yield usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))
+        return
+    path = Path(text)
+    data = parse_yaml(read_text(path, "file of streams"), path)
+    if "driver" in data or "extends" in data or "devices" in data:
+        yield from _of_rig(path)
+        return
+    file = validate(StreamsFile, data, path)
+    for name, stream in file.streams.items():
+        yield _driven(name, stream, PlateFrame.taught(_FLAT))
+
+
+def _of_rig(path: Path) -> Iterator[Source]:
+    """Yield cameras and further streams of a rig file; neither arm nor gripper."""
+    rig, _ = load_rig_file(path)
+    devices = rig.devices
+    if rig.driver != "devices" or devices is None:
+        raise InputError(path, "driver", rig.driver, "must be devices: only those can be recorded")
+    if "events" in rig.cameras:
+        driver = devices.event_camera_driver
+        camera = driver.build(devices.event_camera)
+        size = camera.width, camera.height
+        about = StreamRecord(kind=EVENTS_KIND, rows=0, size_px=size, timing=StreamTiming())
+        stream = DeviceStream(EVENTS_KIND, camera, about)
+        yield Source(stream, READS, locks=driver.locks(devices.event_camera))
+    if "frames" in rig.cameras:
+        yield _first_frames(path, rig, devices)
+    for name, settings in rig.streams.items():
+        yield _driven(name, settings, taught_frame(rig))
+
+
+def _first_frames(path: Path, rig: RigFile, devices: DeviceSettings) -> Source:
+    """Open the first frame camera of a rig file, which has to run by itself."""
+    grade = rig.timing.frames
+    if grade in WIRED:
+        text = "needs the sync box; without an arm write host arrival or device time stamps"
+        raise InputError(path, "timing.frames", grade, text)
+    driver, spec = devices.frame_camera_driver, rig.frame_camera
+    camera = driver.build(devices.frame_camera, spec.scale_px_per_mm)
+    size = spec.width_px, spec.height_px
+    camera.set_region(*size)
+    clock = rig.timing.frame_camera.model_dump()
+    about = StreamRecord(
+        kind=FRAMES_KIND,
+        rows=0,
+        size_px=size,
+        px_per_mm=spec.scale_px_per_mm,
+        mid_exposure_ns=camera.mid_exposure_ns,
+        timing=StreamTiming(**clock, grade=grade, delay=rig.timing.frame_delay),
+    )
+    stream = DeviceStream(FRAMES_KIND, camera, about)
+    return Source(stream, locks=driver.locks(devices.frame_camera))
+
+
+def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
+    driver = stream.driver
+    assert driver is not None
+    if isinstance(driver, ForceSensorDriver) and driver.of_arm:
+        raise InputError(name, "driver", driver.name, "measures through an arm, which is not there")
+    made = driven_stream(name, stream, None, plate)  # type: ignore[arg-type]
+    by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
+    return Source(made, READS if by_reads else TIMING, locks=driver.locks(stream.device))
+
+
+def _check_name(name: str, kind: str | None) -> None:
+    if not NAME.fullmatch(name):
+        raise InputError("streams", "", name, f"a stream's name must match {NAME.pattern}")
+    if name in RESERVED and name != kind:
+        raise InputError("streams", "", name, "is the name of another stream; choose another one")

@@ -1,0 +1,64 @@
+"""Kinds of stream with columns that are only known at run time, and their chunks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import make_dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.streams import READS, SCALAR, Chunk, Column, ScalarChunk, StreamKind
+
+_COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
+TIMES = ("t", "host")
+_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
+CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
+"""Readings of a stream's clock: its time, and between which two times of the host that was."""
+
+
+def table_kind(columns: Mapping[str, str]) -> StreamKind:
+    """Return the kind of a stream of numbers.
+
+    Args:
+        columns: the unit of each, by its name.
+
+    Raises:
+        InputError: there is none, or a name is no small identifier or is taken by the times.
+    """
+    for name in columns or ("",):
+        if not _COLUMN.fullmatch(name) or name in TIMES:
+            text = f"a column's name must match {_COLUMN.pattern}, and be neither t nor host"
+            raise InputError("columns", "", name, text)
+    values = {name: Column(name, "float64", (), unit) for name, unit in columns.items()}
+    return StreamKind("table", {name: SCALAR.columns[name] for name in TIMES} | values)
+
+
+def chunk_type(kind: StreamKind) -> type[Chunk]:
+    """Return the type of a kind's chunks, with an array for each column."""
+    return _chunk_type(kind.name, tuple(kind.columns.items()))
+
+
+@cache
+def _chunk_type(name: str, columns: tuple[tuple[str, Column], ...]) -> type[Chunk]:
+    kind = StreamKind(name, dict(columns))
+    fields = [(column.field, np.ndarray) for _, column in columns]
+    made: Any = make_dataclass(
+        "TableChunk", fields, bases=(Chunk,), namespace={"KIND": kind}, frozen=True
+    )
+    return made
+
+
+def rows(kind: StreamKind, unit: str, arrays: Mapping[str, Any]) -> Chunk:
+    """Return rows as a chunk of a kind.
+
+    Args:
+        unit: of a scalar stream. arrays: values by the column's stored name.
+    """
+    cast = {name: np.asarray(arrays[name], column.dtype) for name, column in kind.columns.items()}
+    if kind == SCALAR:
+        return ScalarChunk.from_columns(cast, unit=unit)
+    return chunk_type(kind).from_columns(cast)

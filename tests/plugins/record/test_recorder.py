@@ -1,0 +1,192 @@
+"""Trials recorded beside a program of its own: what they hold, and what they say."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sliplab
+from sliplab.plugins.record.recorder import RecordedTrial, level, record
+from sliplab.plugins.record.sources import push
+from sliplab.protocols.errors import InputError
+from sliplab.storage.trials.lock import Locked
+from tests.plugins.record.recordings import SIZE, check_rows, feed, sources
+
+
+def test_a_trial_has_rows_condition_and_onsets_of_marks(tmp_path: Path) -> None:
+    with (
+        sliplab.record(sources(), tmp_path, "grasps", operator="Ada") as recording,
+        recording.trial(object="blue mug", grip_n=2.0) as trial,
+    ):
+        feed(trial, 0)
+        trial.mark("contact")
+        trial.mark("slip", trial.begin_ns - 1)
+        trial.mark("slip", trial.begin_ns + 5_000, uncertainty_ms=2)
+        feed(trial, 1)
+        trial.mark("gross", trial.begin_ns + 9_000, uncertainty_ms=3)
+    store = sliplab.open_store(tmp_path)
+    assert store.verify()["ok"]
+    found = store.trial(trial.id)
+    about = found.recording.record
+    check_rows(found.recording)
+    assert about.condition == {"object": "blue_mug", "grip": "2.0 N"}
+    assert about.counts.events == 4000
+    assert about.streams["side"].rows == 2
+    given = about.imported.given
+    assert given.incipient_ns == trial.begin_ns + 5_000
+    assert given.gross_ns == trial.begin_ns + 9_000
+    assert given.uncertainty_ns == 3e6
+    assert [mark.name for mark in about.imported.marks] == [
+        "slip",
+        "slip",
+        "gross",
+        "contact",
+    ]
+    assert "mark slip lies outside of the trial" in about.imported.warnings
+    assert not (found.recording.folder / "journal.jsonl").exists()
+
+
+def test_a_block_that_raises_commits_its_trial_and_says_so(tmp_path: Path) -> None:
+    with record(sources(), tmp_path, "grasps") as recording:
+        trial = recording.trial()
+        with pytest.raises(ZeroDivisionError, match="no grip"), trial:
+            grasp_without_grip(trial)
+        with recording.trial() as second:
+            feed(second, 0)
+    found = sliplab.open_store(tmp_path).trial(trial.id).recording.record
+    assert "ended by ZeroDivisionError: no grip" in found.imported.warnings
+    assert recording.committed == [trial.id, second.id]
+
+
+def grasp_without_grip(trial: RecordedTrial) -> None:
+    feed(trial, 0)
+    raise ZeroDivisionError("no grip")
+
+
+def test_blocks_at_100_khz_from_several_threads_are_all_there(tmp_path: Path) -> None:
+    blocks, rows = 50, 1000
+    with (
+        record([push("pull", {"fx": "N", "fy": "N"})], tmp_path, "fast") as recording,
+        recording.trial() as trial,
+    ):
+
+        def work() -> None:
+            for _ in range(blocks):
+                t_ns = time.monotonic_ns() + np.arange(rows) * 10_000
+                trial.push("pull", t_ns, np.arange(float(rows)), fy=np.zeros(rows))
+
+        threads = [threading.Thread(target=work) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+    found = sliplab.open_store(tmp_path).trial(trial.id).recording
+    late = found.record.devices["pull"]["counts"]["late"]
+    assert found.record.streams["pull"].rows + late == 2 * blocks * rows
+    if late:
+        assert found.record.imported.dropped == {"rows of pull that were lost": late}
+    assert (np.diff(found.samples("pull")["t"]) >= 0).all()
+
+
+def test_more_than_the_buffer_holds_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sliplab.plugins.record.pushed.MOST_BYTES", 10_000)
+    with (
+        record([push("pull", {"fx": "N"})], tmp_path, "lost") as recording,
+        recording.trial() as trial,
+    ):
+        trial.push("pull", time.monotonic_ns() + np.arange(1000), np.zeros(1000))
+        assert trial.lost() == {"pull": 1000}
+    found = sliplab.open_store(tmp_path).trial(trial.id).recording.record
+    assert found.imported.dropped == {"rows of pull that were lost": 1000}
+
+
+def test_own_clocks_are_bounded_by_the_times_of_pushes(tmp_path: Path) -> None:
+    """Times of a clock that began elsewhere come within the stated bound of the host's."""
+    origin = time.monotonic_ns() - 7_000_000_000
+    with (
+        record(
+            [
+                push("temperature", {"t": "degC"}, clock="own"),
+                push("events", events_px=SIZE, clock="own"),
+            ],
+            tmp_path,
+            "own",
+        ) as recording,
+        recording.trial() as trial,
+    ):
+        for _ in range(40):
+            own = time.monotonic_ns() - origin
+            trial.push("temperature", own, 20.0)
+            trial.push("events", own // 1000 + np.arange(3), [1, 2, 3], [1, 2, 3], [0, 1, 0])
+            time.sleep(0.01)  # the sensor's period
+    found = sliplab.open_store(tmp_path).trial(trial.id).recording
+    clocks = found.clocks
+    for name, clock in (("temperature", clocks.streams["temperature"]), ("events", clocks.events)):
+        middle = (trial.begin_ns + trial._end_ns) // 2
+        error = clock.map.to_reference(middle - origin) - middle
+        assert abs(error) <= clock.uncertainty_ns < 60e6, name
+
+
+@pytest.mark.parametrize(
+    ("pushed", "key"),
+    [
+        ((None,), ""),
+        ((1.5, 1.0, 2.0), "t"),
+        ((time.time_ns(), 1.0, 2.0), "t"),
+        ((None, [1.0, 2.0], 1.0), "fx"),
+        ((None, 1.0, 2.0, 3.0), ""),
+    ],
+    ids=["none", "float", "wall clock", "lengths", "too many"],
+)
+def test_wrong_rows_are_refused(tmp_path: Path, pushed: tuple[object, ...], key: str) -> None:
+    with (
+        record([push("pull", {"fx": "N", "fy": "N"})], tmp_path, "wrong") as recording,
+        recording.trial() as trial,
+    ):
+        with pytest.raises(InputError) as raised:
+            trial.push("pull", *pushed)
+        assert raised.value.key == key
+        with pytest.raises(InputError):
+            trial.push("nothing", None, 1.0)
+    with pytest.raises(RuntimeError, match="no trial"):
+        trial.push("pull", None, 1.0, 2.0)
+
+
+def test_one_program_at_a_time_and_one_kind_of_campaign(tmp_path: Path) -> None:
+    with record(sources(), tmp_path, "grasps"), pytest.raises(Locked):
+        record(sources(), tmp_path, "grasps").__enter__()
+    with pytest.raises(InputError, match="simulated"):
+        record(sources(), tmp_path, "grasps", simulated=True).__enter__()
+
+
+def test_settings_of_the_analysis_are_those_of_an_adapter(tmp_path: Path) -> None:
+    file = tmp_path / "analysis.yaml"
+    file.write_text("title: Grasps\nanalysis: {training: {epochs: 3}}\n")
+    with record(sources(), tmp_path / "store", "grasps", analysis=file):
+        pass
+    file.write_text("streams: {}\n")
+    with pytest.raises(InputError, match="must be one of"):
+        record(sources(), tmp_path / "store", "grasps", analysis=file).__enter__()
+    text = (tmp_path / "store" / "campaigns" / "grasps" / "protocol.yaml").read_text()
+    assert "Grasps" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("grip_n", 2.0, ("grip", "2.0 N")),
+        ("speed_mm_s", 10, ("speed", "10 mm/s")),
+        ("object", "blue mug", ("object", "blue_mug")),
+        ("n", 3, ("n", "3")),
+    ],
+)
+def test_a_condition_has_its_unit_in_its_name(
+    name: str, value: object, expected: tuple[str, str]
+) -> None:
+    assert level(name, value) == expected
