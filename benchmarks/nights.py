@@ -310,9 +310,7 @@ def measure(folder: Path, minutes: int, open_min: int, closed_min: int, browser:
         end = plan[-1].ends + timedelta(seconds=LATE_S)
         pause, counts = threading.Event(), []
         while datetime.now(UTC) < end and child.poll() is None:
-            table.writerows(sample(child.pid, began))
-            if browser:
-                table.writerows(sample(os.getpid(), began))
+            table.writerows(sample(os.getpid(), began))
             out.flush()
             counts.append(pictures())
             pause.wait(SAMPLE_S)

@@ -108,6 +108,9 @@ class Plan:
     _programs: dict[tuple[tuple[str, Level], ...], Program] = field(
         default_factory=dict, repr=False, compare=False
     )
+    _seconds: dict[tuple[tuple[tuple[str, Level], ...], bool], float] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def __repr__(self) -> str:
         hours = self.total_seconds / 3600
@@ -147,7 +150,10 @@ class Plan:
 
     def seconds(self, trial: Trial, *, recorded_only: bool = False) -> float:
         """Planned seconds of motion of one trial."""
-        return self.program(trial).seconds(recorded_only=recorded_only)
+        key = trial.condition, recorded_only
+        if key not in self._seconds:  # the live page asks for all trials every few seconds
+            self._seconds[key] = self.program(trial).seconds(recorded_only=recorded_only)
+        return self._seconds[key]
 
     @cached_property
     def total_seconds(self) -> float:

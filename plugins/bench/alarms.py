@@ -123,7 +123,7 @@ class Level:
 
     Attributes:
         asked: false alarms an hour.
-        allowed: false alarms of all validation scenes at the level, at the most.
+        allowed: false alarms of all validation scenes at the level.
         promised: the upper end of their rate's 95 % interval is at most `asked`. If not, there
             were too few hours for that, and the level is that without a false alarm.
     """
@@ -143,21 +143,25 @@ def promised_levels(scenes: Sequence[SceneEvidence], rates: Sequence[float]) -> 
     not depend on the scenes: so the choice errs no more often than one interval does (fixed
     sequence testing; Angelopoulos et al. 2021, arXiv 2110.01052, section 2.3).
     """
-    tried: list[tuple[int, float, float]] = []  # allowed alarms, level, upper end of the rate
+    tried: list[tuple[float, AlarmRate]] = []  # levels, and the rates at them
+    allowed = [0]
 
-    def trial(place: int) -> tuple[int, float, float]:
+    def trial(place: int) -> tuple[float, AlarmRate]:
         while place >= len(tried):
-            allowed = max(tried[-1][0] + 1, tried[-1][0] * 5 // 4) if tried else 0
-            level = level_at(scenes, allowed)
-            high = false_alarm_rate(scenes, level).high
-            tried.append((allowed, level, np.inf if high is None else high))
+            level = level_at(scenes, allowed[-1])
+            tried.append((level, false_alarm_rate(scenes, level)))
+            allowed.append(max(allowed[-1] + 1, allowed[-1] * 5 // 4))
         return tried[place]
 
     found = []
     for rate in rates:
         kept = 0
-        while trial(kept)[2] <= rate and (kept == 0 or np.isfinite(trial(kept - 1)[1])):
+        while _below(trial(kept)[1], rate) and (kept == 0 or np.isfinite(trial(kept - 1)[0])):
             kept += 1
-        allowed, level, _ = trial(max(kept - 1, 0))
-        found.append(Level(rate, allowed, level, promised=kept > 0))
+        level, alarms = trial(max(kept - 1, 0))
+        found.append(Level(rate, alarms.alarms, level, promised=kept > 0))
     return found
+
+
+def _below(found: AlarmRate, rate: float) -> bool:
+    return found.high is not None and found.high <= rate

@@ -41,8 +41,8 @@ class BenchPoint(Part):
     """A detector on test scenes at one asked rate of false alarms.
 
     Attributes:
-        asked: false alarms an hour. allowed: in all validation scenes, at the most.
-        level: lowest at which these have no more; None where nothing bounds it.
+        asked: false alarms an hour. allowed: those of all validation scenes at the level.
+        level: None where nothing bounds it.
         promised: the upper end of the validation scenes' rate is at most `asked`; None in older
             results. If not, their hours were too few.
     """

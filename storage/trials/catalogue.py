@@ -81,13 +81,14 @@ def catalogue_so_far(
 
     Args:
         unreadable: as of `catalogue`, which it otherwise is.
-        within_s: no trial but the first is begun later; in a large store, listing it and writing
-            the index take some seconds more.
+        within_s: no trial but the first is begun later, or as long as listing the store took where
+            that is more; in a large store, writing the index takes some seconds more.
     """
-    began_ns = time.time_ns()
+    began_ns, began = time.time_ns(), time.monotonic()
     found = [(campaign, _Listing.of(campaign)) for campaign in store.campaigns()]
     known = _read_index(store) or _Index(pd.DataFrame())
-    parts, problems, end = [], [], time.monotonic() + within_s
+    listed = time.monotonic()
+    parts, problems, end = [], [], listed + max(within_s, listed - began)
     for campaign, listing in found:
         part = _CampaignRows(campaign, listing, known)
         parts.append(part)

@@ -9,7 +9,9 @@ export function localTimes(parent) {
 }
 localTimes(document);
 
-// A page that is not complete yet loads itself again, unless somebody fills in its form.
-if (document.querySelector("[data-reading]")) {
-  setInterval(() => document.querySelector("form :focus") || location.reload(), 1000);
+// A page that is not complete yet loads itself again, once nobody fills in its form.
+function loadAgain() {
+  if (document.querySelector("form :focus")) setTimeout(loadAgain, 1000);
+  else location.reload();
 }
+if (document.querySelector("[data-reading]")) setTimeout(loadAgain, 1000);

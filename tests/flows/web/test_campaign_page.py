@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 
 from sliplab.flows.log import log_entries
+from sliplab.flows.running import run_records
 from sliplab.flows.status import StatusReader
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.browser import launched, needs_browser, sync_api
 from tests.flows.conftest import write
 from tests.flows.live import quick, rig_yaml
-from tests.flows.server.serving import serving
+from tests.flows.server.serving import serving, until
 
 pytestmark = [needs_browser, pytest.mark.programs, pytest.mark.long]
 TRIALS = 40
@@ -103,6 +104,7 @@ def drive(browser: Any, link: str, folder: Path, protocol: str, planned: int) ->
     ben.start(protocol, TRIALS - status.committed, "goes on")
     ben.sees("#status", f"{TRIALS} of {planned} done")
     ben.sees("#now .big", "Nothing runs")
+    until("the end of its run", lambda: not run_records.open_runs(folder))
     (status,) = StatusReader(store).read().campaigns
     assert status.committed == TRIALS
     log = [(entry.what, entry.who, entry.text) for entry in log_entries(store)]

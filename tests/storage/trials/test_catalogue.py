@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import shutil
 from pathlib import Path
@@ -92,8 +93,11 @@ def test_only_what_changed_is_read_again(where: Campaign, read: list[str]) -> No
     _both(where)
 
 
-def test_reading_goes_on_where_its_time_ended(where: Campaign, read: list[str]) -> None:
-    store = _store(where)
+def test_reading_goes_on_where_its_time_ended(
+    where: Campaign, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, clock = _store(where), itertools.count()
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock) ** 2)  # ever slower
     for names in ("a", "ab", "abc"):  # the first of each is read in any case
         table, left = catalogue_so_far(store, [], -1.0)
         assert (list(table["trial"]), left) == (list(names), 3 - len(names))
