@@ -43,7 +43,7 @@ def kill_at(folder: Path, seconds: float, early: bool) -> int:
     verified = [path.name for path in killed(campaign) if read_journal(path)]
     salvage_campaign(campaign)
     after = campaign.committed()
-    assert before | set(verified) == after
+    assert before | set(verified) <= after  # and those whose record was written
     assert verify(str(folder))["ok"]
     cut = 0
     for recording in campaign.recordings():
