@@ -250,15 +250,15 @@ class LslStream:
             self._waiting -= sum(len(part[0]) for part in parts)
             if not parts and self._fault is not None:
                 raise RigError(f"{DEVICE} {self._settings.name}", self._fault)
-        made = chunk_type(self.kind)
         if not parts:
-            return made.empty()
+            return chunk_type(self.kind).empty()
         t_ns, host, stamp, values = map(np.concatenate, zip(*parts, strict=True))
         t_ns = np.maximum.accumulate(t_ns)
         if self._last_t is not None:
             t_ns = np.maximum(t_ns, self._last_t)
         self._last_t = int(t_ns[-1])
-        return made(t_ns, host, stamp, *np.ascontiguousarray(values.T))
+        columns = (t_ns, host, stamp, *np.ascontiguousarray(values.T))
+        return rows(self.kind, "", dict(zip(self.kind.columns, columns, strict=True)))
 
     def clock_reads(self) -> Chunk:
         """Return the readings of the clock since the last call; their times are without jumps."""

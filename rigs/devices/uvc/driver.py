@@ -21,7 +21,7 @@ from sliplab.rigs.devices.uvc.settings import UvcSettings, is_camera
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 DEVICE = "frame camera"
-OPEN_S = 8.0
+OPEN_S = 20.0
 """Timeout for the process to start, to open the camera and to have its first picture, s."""
 ANSWER_S = 3.0
 """Timeout of a call, s."""

@@ -26,9 +26,15 @@ from tests.plugins.record.recordings import (
 MOMENTS = (8, 200)
 
 
-def kill_at(folder: Path, seconds: float) -> int:
-    """Kill a recording after some time; return how many trials were cut."""
+def kill_at(folder: Path, seconds: float, early: bool) -> int:
+    """Kill a recording at a moment; return how many trials were cut.
+
+    Args:
+        early: count from the program's start; else from the first state of its first trial.
+    """
     with forked(lambda: record_for_ever(folder)):
+        if not early:
+            wait_for_states(folder, 1)
         time.sleep(seconds)  # the moment of the kill
     if not (folder / "store.json").exists() or not campaign_of(folder).begun:
         return 0
@@ -37,7 +43,7 @@ def kill_at(folder: Path, seconds: float) -> int:
     verified = [path.name for path in killed(campaign) if read_journal(path)]
     salvage_campaign(campaign)
     after = campaign.committed()
-    assert before | set(verified) == after
+    assert before | set(verified) <= after  # and those whose record was written
     assert verify(str(folder))["ok"]
     cut = 0
     for recording in campaign.recordings():
@@ -53,7 +59,7 @@ def test_killed_recordings_keep_what_was_committed_and_what_verifies(
     tmp_path: Path, moments: int
 ) -> None:
     chance = random.Random(moments)
-    cut = [kill_at(tmp_path / str(n), 0.2 + 3.0 * chance.random()) for n in range(moments)]
+    cut = [kill_at(tmp_path / str(n), 2 * chance.random(), n % 4 == 0) for n in range(moments)]
     assert sum(cut) >= moments // 4
 
 

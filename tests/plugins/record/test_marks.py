@@ -11,7 +11,7 @@ import pytest
 import sliplab
 from sliplab.plugins.record.recorder import RecordedTrial
 
-EVENTS_PX = (128, 96)
+EVENTS_PX = (480, 400)
 SECONDS, SLIP_S, GROSS_S = 1.2, 0.6, 0.9
 ANALYSIS = """
 analysis: {training: {epochs: 1}}
