@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -12,68 +11,55 @@ import pytest
 
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store
-from tests.conftest import ROOT
-from tests.flows.server.serving import serving, until
-from tests.flows.server.test_serve_access import EVIL, Service
+from tests.flows.server.serving import EVIL, Service, until
 
 pytestmark = pytest.mark.programs
 PAGES = ("/", "/live", "/trials", "/review", "/report", "/log", "/schedules")
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """`sliplab serve` with its own server."""
-    folder = tmp_path_factory.mktemp("page")
-    rig = ROOT / "rigs" / "rehearsal.yaml"
-    with serving(folder / "store", rig, "page", None, folder / "serve.log") as page:
-        found = Service(page, folder / "store")
-        until("the page", lambda: found.ask("GET", "/log")[0] == 401)
-        yield found
-
-
-def entered(service: Service, role: str) -> dict[str, str]:
+def entered(served: Service, role: str) -> dict[str, str]:
     """The headers of a browser that has opened a link."""
-    link = urlsplit((service.store / ".prefect" / f"{role}-link").read_text().strip())
-    status, headers, _ = service.ask("GET", f"{link.path}?{link.query}")
+    link = urlsplit((served.store / ".prefect" / f"{role}-link").read_text().strip())
+    status, headers, _ = served.ask("GET", f"{link.path}?{link.query}")
     assert status == 200
     assert parse_qs(link.query)["token"][0] not in headers["set-cookie"]
     return {"Cookie": headers["set-cookie"].partition(";")[0]}
 
 
 @pytest.mark.parametrize("path", PAGES)
-def test_page_is_for_known_viewers_of_this_computer(service: Service, path: str) -> None:
-    assert service.ask("GET", path)[0] == 401
-    reader = entered(service, "reader")
+def test_page_is_for_known_viewers_of_this_computer(served: Service, path: str) -> None:
+    assert served.ask("GET", path)[0] == 401
+    reader = entered(served, "reader")
     if path != "/live":  # which goes on
-        assert service.ask("GET", path, **reader)[0] == 200
-    assert service.ask("GET", path, **reader, Origin=EVIL)[0] == 403
-    assert service.handshake(path, **reader) == 403
-    status, _, text = service.ask("GET", path, **(reader | {"Host": "evil.example"}))
+        assert served.ask("GET", path, **reader)[0] == 200
+    assert served.ask("GET", path, **reader, Origin=EVIL)[0] == 403
+    assert served.handshake(path, **reader) == 403
+    status, _, text = served.ask("GET", path, **(reader | {"Host": "evil.example"}))
     assert status == 421, text
 
 
-def test_link_changes_nothing_without_its_form(service: Service) -> None:
+def test_link_changes_nothing_without_its_form(served: Service) -> None:
     form = {"Content_Type": "application/x-www-form-urlencoded"}
     for role in ("reader", "operator"):
-        known = entered(service, role)
+        known = entered(served, role)
         for action in ("pause", "stop", "collect"):
             body = "who=Eve&why=x&csrf=guess"
-            assert service.ask("POST", f"/control/{action}", body, **known, **form)[0] == 403
-    assert control.requests(Store.open(service.store)) == []
+            assert served.ask("POST", f"/control/{action}", body, **known, **form)[0] == 403
+    assert control.requests(Store.open(served.store)) == []
 
 
-def test_links_are_no_way_into_prefects_interface(service: Service) -> None:
-    operator = entered(service, "operator")
-    assert service.ask("GET", "/api/admin/version", **operator)[0] == 401
+def test_links_are_no_way_into_prefects_interface(served: Service) -> None:
+    operator = entered(served, "operator")
+    assert served.ask("GET", "/api/admin/version", **operator)[0] == 401
 
 
-def test_killed_page_takes_nothing_along_and_comes_again(service: Service) -> None:
-    (pid,) = _pages(service.store)
+def test_killed_page_takes_nothing_along_and_comes_again(served: Service) -> None:
+    (pid,), before = _pages(served.store), served.runs()
     os.kill(pid, signal.SIGKILL)
-    until("its end", lambda: service.ask("GET", "/log")[0] == 503)
-    assert service.page.call("/flow_runs/filter", {}) == []
-    until("another one", lambda: service.ask("GET", "/log")[0] == 401)
-    assert _pages(service.store) != [pid]
+    until("its end", lambda: served.ask("GET", "/log")[0] == 503)
+    assert served.runs() == before
+    until("another one", lambda: served.ask("GET", "/log")[0] == 401)
+    assert _pages(served.store) != [pid]
 
 
 def _pages(store: Path) -> list[int]:
