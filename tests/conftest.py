@@ -9,6 +9,7 @@ import functools
 import gc
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -25,6 +26,10 @@ settings.register_profile("sliplab", deadline=None, derandomize=True, print_blob
 settings.load_profile("sliplab")
 
 MEMORY, ROOM_GB = Path("/dev/shm"), 16
+
+# what one worker or program has compiled, the others need not
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def _write_in_memory() -> None:
@@ -51,6 +56,8 @@ atexit.register(shutil.rmtree, os.environ["SLIPLAB_RUNTIME"], ignore_errors=True
 # commands run in this process: their signatures are read once, not again for each command
 typer.main.get_params_from_function = functools.cache(typer.main.get_params_from_function)
 
+SHARED = {"ran", "served"}
+"""Fixtures that several files use and that take long to make."""
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 
 
@@ -89,14 +96,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests of a file, and all files that use the small study, in one worker.
+    """Keep the tests of a file, and all files that use one study or service, in one worker.
 
     What they share is made once then. Tests in real time name their groups themselves.
     """
-    shared = {item.path for item in items if "ran" in getattr(item, "fixturenames", ())}
+    shared = {
+        item.path: name
+        for item in items
+        for name in SHARED.intersection(getattr(item, "fixturenames", ()))
+    }
     for item in items:
         if item.get_closest_marker("realtime") is None:
-            group = "ran" if item.path in shared else str(item.path)
+            group = shared.get(item.path, str(item.path))
             item.add_marker(pytest.mark.xdist_group(group))
 
 

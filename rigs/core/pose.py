@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -42,16 +43,14 @@ def from_ur(values: Sequence[float]) -> Pose:
 
 def quaternion(pose: Pose) -> tuple[float, float, float, float]:
     """Return the tool's rotation as a unit quaternion w x y z with w >= 0."""
-    w, x, y, z = _rotation(pose).as_quat(canonical=True, scalar_first=True).tolist()
-    return w, x, y, z
+    return _quaternion(pose.rotvec_deg)
 
 
 def from_quaternion(xyz_mm: Sequence[float], wxyz: Sequence[float]) -> Pose:
     """Convert a position in mm and a quaternion w x y z of any non-zero norm to a pose."""
-    rotation = Rotation.from_quat(np.asarray(wxyz, np.float64), scalar_first=True)
+    w, a, b, c = (float(value) for value in wxyz)
     x, y, z = (float(value) for value in xyz_mm)
-    a, b, c = np.degrees(rotation.as_rotvec()).tolist()
-    return Pose((x, y, z), (a, b, c))
+    return Pose((x, y, z), _rotvec_deg(w, a, b, c))
 
 
 def short_rotvec_deg(rotvec_deg: F64) -> F64:
@@ -83,6 +82,8 @@ def inverse(pose: Pose) -> Pose:
 
 def angle_deg(one: Pose, other: Pose) -> float:
     """Angle of the smallest rotation from one pose's orientation to the other's, degrees."""
+    if one.rotvec_deg == other.rotvec_deg:
+        return 0.0
     return math.degrees((_rotation(one).inv() * _rotation(other)).magnitude())
 
 
@@ -125,3 +126,20 @@ def straight_path(one: Pose, other: Pose) -> Callable[[float], Pose]:
 
 def _rotation(pose: Pose) -> Rotation:
     return Rotation.from_rotvec(np.radians(pose.rotvec_deg))
+
+
+# A controller reports the same orientation hundreds of times a second: each is converted once.
+
+
+@lru_cache(64)
+def _quaternion(rotvec_deg: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    rotation = Rotation.from_rotvec(np.radians(rotvec_deg))
+    w, x, y, z = rotation.as_quat(canonical=True, scalar_first=True).tolist()
+    return w, x, y, z
+
+
+@lru_cache(64)
+def _rotvec_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    rotation = Rotation.from_quat(np.array([w, x, y, z]), scalar_first=True)
+    a, b, c = np.degrees(rotation.as_rotvec()).tolist()
+    return a, b, c

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -51,7 +53,8 @@ def run(folder: Path, *, factor: int = 1, twice: int = 2, base: int = 0) -> tupl
 
 
 @pytest.fixture(autouse=True)
-def _modules_are_removed() -> Iterator[None]:
+def _as_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     yield
     for name in [name for name in sys.modules if name.startswith("sliplab.made_")]:
         del sys.modules[name]
@@ -67,19 +70,44 @@ def test_a_kernel_is_compiled_again_when_another_file_changes(tmp_path: Path) ->
     assert run(tmp_path, base=1) == (21, 2)
 
 
-def test_kernels_of_earlier_versions_are_deleted(tmp_path: Path) -> None:
-    for twice in (2, 3, 4):
+def test_another_checkout_takes_what_one_has_compiled(tmp_path: Path) -> None:
+    for name, kept in (("one", 0), ("other", 2)):
+        (tmp_path / name).mkdir()
+        assert run(tmp_path / name) == (20, kept)
+    assert sorted(it.name for it in tmp_path.iterdir() if it.name != "cache") == ["one", "other"]
+    assert not list(tmp_path.glob("o*/__pycache__"))
+
+
+def test_kernels_that_nobody_uses_are_deleted(tmp_path: Path) -> None:
+    for twice in (2, 3):
         run(tmp_path, twice=twice)
-    folders = sorted(it.name for it in (tmp_path / "__pycache__").glob("kernels-*"))
-    assert [name.rpartition("-")[0] for name in folders] == [
-        "kernels-made_callee",
-        "kernels-made_caller",
-    ]
+    folders = {it.name for it in (tmp_path / "cache/sliplab/kernels").iterdir()}
+    assert len(folders) == 4
+    for folder in (tmp_path / "cache/sliplab/kernels").iterdir():
+        os.utime(folder, (0, time.time() - kernels._KEPT_S - 60))
+    assert run(tmp_path, twice=2) == (20, 2)
+    left = {it.name for it in (tmp_path / "cache/sliplab/kernels").iterdir()}
+    assert len(left) == 2
+    assert left < folders
+    assert {name.rpartition("-")[0] for name in left} == {
+        "sliplab.made_callee",
+        "sliplab.made_caller",
+    }
 
 
 def test_a_folder_that_is_named_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "named"))
     assert run(tmp_path) == (20, 0)
     assert run(tmp_path) == (20, 2)
-    assert not (tmp_path / "__pycache__").exists()
-    assert len(list((tmp_path / "named").glob("kernels-sliplab.made_*"))) == 2
+    assert not (tmp_path / "cache").exists()
+    assert len(list((tmp_path / "named").glob("sliplab.made_*"))) == 2
+
+
+def test_a_user_without_a_place_keeps_them_beside_the_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert run(tmp_path) == (20, 0)
+    assert run(tmp_path) == (20, 2)
+    assert len(list((tmp_path / "__pycache__").glob("sliplab.made_*"))) == 2

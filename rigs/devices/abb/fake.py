@@ -340,7 +340,9 @@ class FakeAbb(FakeController):
         self._number += 1
         if self._to_lose > 0:
             self._to_lose -= 1
-        elif not self._silent and not late:
+        elif late:
+            self.unsent += 1
+        elif not self._silent:
             with contextlib.suppress(OSError):
                 self._udp.sendto(self._packet(t_s), self._egm)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import json
 import os
 import re
@@ -18,11 +19,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from tests.conftest import ROOT
 
 LIMIT_S = 120.0
 BUSY_S = 10.0
+EVIL = "http://evil.example"
 FINAL = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 
 
@@ -149,3 +152,37 @@ def serving(
         if process.poll() is None:
             process.kill()
             process.wait(60)
+
+
+class Service:
+    """A service of its own process with its own server, as a stranger reaches it: raw HTTP."""
+
+    def __init__(self, page: Page, store: Path) -> None:
+        self.page, self.store = page, store
+        self.port = urlsplit(page.url).port or 0
+        self.host = f"127.0.0.1:{self.port}"
+
+    def runs(self) -> int:
+        """How many flow runs there are."""
+        return len(self.page.call("/flow_runs/filter", {}))
+
+    def ask(
+        self, method: str, path: str, body: str | None = None, **headers: str
+    ) -> tuple[int, dict[str, str], str]:
+        """Status, headers in lower case, and text of one answer; names with `_` for `-`."""
+        line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        try:
+            sent = {"Host": self.host, **{k.replace("_", "-"): v for k, v in headers.items()}}
+            line.request(method, path, body, sent)
+            answer = line.getresponse()
+            text = answer.read().decode(errors="replace")
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, text
+        finally:
+            line.close()
+
+    def handshake(self, path: str, **headers: str) -> int:
+        """The status that answers a websocket's first request."""
+        sent = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
+        key = base64.b64encode(b"0" * 16).decode()
+        sent |= {"Sec_WebSocket_Key": key, "Sec_WebSocket_Protocol": "prefect"}
+        return self.ask("GET", path, **sent, **headers)[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.server.serving import serving, until
+from tests.flows.server.serving import Page, serving, until
 
 pytestmark = pytest.mark.programs
 
@@ -32,34 +33,44 @@ def process_of(run: str) -> int:
     return 0
 
 
-def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(tmp_path: Path) -> None:
-    protocol = write(tmp_path / "protocol.yaml", tiny())
-    store, log = tmp_path / "store", tmp_path / "log"
-    trials, records = store / "campaigns" / "tiny" / "trials", store / "control" / "runs"
-    nights = tmp_path / "schedules.yaml"  # its folder is one from which protocols may be named
-    nights.write_text("timezone: UTC\nschedules: []\n")
-    with serving(store, RIG, "ends", None, log, nights) as page:
-        killed = page.run("collect", protocol=str(protocol))["id"]
-        until("a trial", lambda: trials.is_dir() and any(trials.iterdir()))
-        os.kill(process_of(killed), signal.SIGKILL)
-        said = page.ended(killed)
-        assert (said["type"], said["message"]) == ("CRASHED", "its process was killed (-9)")
-        assert len(list(trials.iterdir())) < 6
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A service with a push that hangs: its place's marker is a pipe that nobody writes to."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "remote").mkdir()
+    os.mkfifo(folder / "remote" / LAYOUT_FILE)
+    nights = folder / "schedules.yaml"  # its folder is one from which protocols may be named
+    nights.write_text(
+        "timezone: UTC\nschedules:\n"
+        f"  - {{name: copy, flow: push, url: 'file://{folder}/remote', cron: '0 0 1 1 *'}}\n"
+    )
+    Store.create(folder / "store")
+    with serving(folder / "store", RIG, "ends", None, folder / "log", nights) as found:
+        yield found
 
-        suspended = page.run("collect", protocol=str(protocol))["id"]
-        until("a run", lambda: page.state(suspended)["type"] == "RUNNING")
-        paused = {
-            "type": "PAUSED",
-            "name": "Suspended",
-            "state_details": {"pause_reschedule": True},
-        }
-        answer = page.call(f"/flow_runs/{suspended}/set_state", {"state": paused})
-        assert answer["status"] == "ACCEPT", answer
-        until("its process", lambda: not process_of(suspended))
-        assert page.state(suspended)["type"] == "PAUSED"
-        page.call(f"/flow_runs/{suspended}/resume", {})
-        assert page.ended(suspended)["type"] == "COMPLETED", log.read_text()
-        assert len(list(trials.iterdir())) == 6
+
+def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:
+    folder = page.log.parent
+    protocol = write(folder / "protocol.yaml", tiny())
+    store = folder / "store"
+    trials, records = store / "campaigns" / "tiny" / "trials", store / "control" / "runs"
+    killed = page.run("collect", protocol=str(protocol))["id"]
+    until("a trial", lambda: trials.is_dir() and any(trials.iterdir()))
+    os.kill(process_of(killed), signal.SIGKILL)
+    said = page.ended(killed)
+    assert (said["type"], said["message"]) == ("CRASHED", "its process was killed (-9)")
+    assert len(list(trials.iterdir())) < 6
+
+    suspended = page.run("collect", protocol=str(protocol))["id"]
+    until("a run", lambda: page.state(suspended)["type"] == "RUNNING")
+    paused = {"type": "PAUSED", "name": "Suspended", "state_details": {"pause_reschedule": True}}
+    answer = page.call(f"/flow_runs/{suspended}/set_state", {"state": paused})
+    assert answer["status"] == "ACCEPT", answer
+    until("its process", lambda: not process_of(suspended))
+    assert page.state(suspended)["type"] == "PAUSED"
+    page.call(f"/flow_runs/{suspended}/resume", {})
+    assert page.ended(suspended)["type"] == "COMPLETED", page.log.read_text()
+    assert len(list(trials.iterdir())) == 6
     ends = [read_json(path) for path in records.glob("*.end.json")]
     assert sorted((end["state"], end["by"]) for end in ends) == [
         ("COMPLETED", "flow"),
@@ -67,24 +78,16 @@ def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(tmp_path: Path) -> N
     ]
 
 
-def test_a_push_that_hangs_delays_no_collection(tmp_path: Path) -> None:
-    """The remote place answers nothing: its marker is a pipe that nobody writes to."""
-    protocol = write(tmp_path / "protocol.yaml", tiny())
-    store, log, remote = tmp_path / "store", tmp_path / "log", tmp_path / "remote"
-    remote.mkdir()
-    os.mkfifo(remote / LAYOUT_FILE)
-    nights = tmp_path / "schedules.yaml"
-    nights.write_text(
-        "timezone: UTC\nschedules:\n"
-        f"  - {{name: copy, flow: push, url: 'file://{remote}', cron: '0 0 1 1 *'}}\n"
-    )
-    Store.create(store)
-    with serving(store, RIG, "beside", None, log, nights) as page:
-        pushing = page.run("push")["id"]
-        until("the push", lambda: page.state(pushing)["type"] == "RUNNING")
-        taking = page.run("collect", protocol=str(protocol))["id"]
-        said = page.ended(taking)
-        assert said["type"] == "COMPLETED", log.read_text()
-        assert page.state(pushing)["type"] == "RUNNING"
-        page.cancel(pushing)
-        assert page.ended(pushing)["type"] == "CANCELLED"
+def test_a_push_that_hangs_delays_no_collection(page: Page) -> None:
+    data = tiny()
+    data["name"] = "beside"
+    protocol = write(page.log.parent / "beside.yaml", data)
+    pushing = page.run("push")["id"]
+    until("the push", lambda: page.state(pushing)["type"] == "RUNNING")
+    taking = page.run("collect", protocol=str(protocol), trials=1)["id"]
+    said = page.ended(taking)
+    assert said["type"] == "COMPLETED", page.log.read_text()
+    assert "1 of 6 committed" in said["message"]
+    assert page.state(pushing)["type"] == "RUNNING"
+    page.cancel(pushing)
+    assert page.ended(pushing)["type"] == "CANCELLED"

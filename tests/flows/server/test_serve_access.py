@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import http.client
 import json
 import os
 import re
@@ -11,10 +10,8 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import pytest
@@ -23,51 +20,11 @@ from sliplab.flows.server import page_server
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
-from tests.flows.server.serving import Page, serving, until
+from tests.flows.server.serving import EVIL, Service, serving, until
 
 pytestmark = pytest.mark.programs
 
-EVIL = "http://evil.example"
 RUN = {"parameters": {"wanted": {"protocol": "pilot.yaml"}}, "state": {"type": "SCHEDULED"}}
-
-
-class Service:
-    """A service of its own process with its own server, as a stranger reaches it: raw HTTP."""
-
-    def __init__(self, page: Page, store: Path) -> None:
-        self.page, self.store = page, store
-        self.port = urlsplit(page.url).port or 0
-        self.host = f"127.0.0.1:{self.port}"
-
-    def ask(
-        self, method: str, path: str, body: str | None = None, **headers: str
-    ) -> tuple[int, dict[str, str], str]:
-        """Status, headers in lower case, and text of one answer; names with `_` for `-`."""
-        line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
-        try:
-            sent = {"Host": self.host, **{k.replace("_", "-"): v for k, v in headers.items()}}
-            line.request(method, path, body, sent)
-            answer = line.getresponse()
-            text = answer.read().decode(errors="replace")
-            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, text
-        finally:
-            line.close()
-
-    def handshake(self, path: str, **headers: str) -> int:
-        """The status that answers a websocket's first request."""
-        sent = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
-        key = base64.b64encode(b"0" * 16).decode()
-        sent |= {"Sec_WebSocket_Key": key, "Sec_WebSocket_Protocol": "prefect"}
-        return self.ask("GET", path, **sent, **headers)[0]
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """`sliplab serve` with its own server."""
-    folder = tmp_path_factory.mktemp("access")
-    rig = ROOT / "rigs" / "rehearsal.yaml"
-    with serving(folder / "store", rig, "access", None, folder / "serve.log") as page:
-        yield Service(page, folder / "store")
 
 
 def basic(password: str) -> str:
@@ -75,49 +32,47 @@ def basic(password: str) -> str:
     return f"Basic {base64.b64encode(password.encode()).decode()}"
 
 
-def test_a_foreign_page_gets_no_leave_to_ask(service: Service) -> None:
+def test_a_foreign_page_gets_no_leave_to_ask(served: Service) -> None:
     asked = {"Method": "POST", "Headers": "content-type"}
     asked = {f"Access_Control_Request_{name}": value for name, value in asked.items()}
-    status, headers, _ = service.ask("OPTIONS", "/api/deployments/filter", Origin=EVIL, **asked)
+    status, headers, _ = served.ask("OPTIONS", "/api/deployments/filter", Origin=EVIL, **asked)
     assert (status, headers.get("access-control-allow-origin")) == (403, None)
 
 
 @pytest.mark.parametrize("kind", ["application/json", "text/plain"])
 @pytest.mark.parametrize("origin", [EVIL, "null", "http://127.0.0.1:1", "https://localhost"])
-def test_a_foreign_page_is_answered_nothing(service: Service, origin: str, kind: str) -> None:
-    known = basic(service.page.password)  # even with the password
-    deployment = service.page.deployment("collect")["id"]
+def test_a_foreign_page_is_answered_nothing(served: Service, origin: str, kind: str) -> None:
+    known = basic(served.page.password)  # even with the password
+    before, deployment = served.runs(), served.page.deployment("collect")["id"]
     run = f"/api/deployments/{deployment}/create_flow_run"
     for path, body in (("/api/deployments/filter", "{}"), (run, json.dumps(RUN))):
-        status, headers, text = service.ask(
+        status, headers, text = served.ask(
             "POST", path, body, Origin=origin, Content_Type=kind, Authorization=known
         )
         assert (status, headers.get("access-control-allow-origin")) == (403, None), text
     path, sent = f"/api/deployments/{deployment}", {"Origin": origin, "Authorization": known}
     for method in ("GET", "PATCH", "DELETE"):
-        assert service.ask(method, path, **sent)[0] == 403
-    assert service.page.call("/flow_runs/filter", {}) == []  # nothing was started
-    assert service.page.deployment("collect")["id"] == deployment
+        assert served.ask(method, path, **sent)[0] == 403
+    assert served.runs() == before  # nothing was started
+    assert served.page.deployment("collect")["id"] == deployment
 
 
-def test_a_foreign_host_name_is_no_way_in(service: Service) -> None:
-    known = basic(service.page.password)
-    for host in ("evil.example", f"evil.example:{service.port}", "127.0.0.1:1", "localhost", ""):
+def test_a_foreign_host_name_is_no_way_in(served: Service) -> None:
+    known = basic(served.page.password)
+    for host in ("evil.example", f"evil.example:{served.port}", "127.0.0.1:1", "localhost", ""):
         for path in ("/", "/ui-settings", "/api/health", "/api/admin/version"):
-            assert service.ask("GET", path, Host=host, Authorization=known)[0] == 421, (host, path)
+            assert served.ask("GET", path, Host=host, Authorization=known)[0] == 421, (host, path)
     for name in ("127.0.0.1", "localhost", "LOCALHOST", "[::1]"):
-        host = f"{name}:{service.port}"
+        host = f"{name}:{served.port}"
         own = {"Host": host, "Origin": f"http://{host.lower()}", "Authorization": known}
-        assert service.ask("GET", "/api/admin/version", **own)[0] == 200, name
-    with socket.create_connection(("127.0.0.1", service.port), timeout=30) as line:
-        line.sendall(
-            f"GET /api/health HTTP/1.1\r\nHost: {service.host}\r\nHost: x\r\n\r\n".encode()
-        )
+        assert served.ask("GET", "/api/admin/version", **own)[0] == 200, name
+    with socket.create_connection(("127.0.0.1", served.port), timeout=30) as line:
+        line.sendall(f"GET /api/health HTTP/1.1\r\nHost: {served.host}\r\nHost: x\r\n\r\n".encode())
         assert line.recv(100).split()[1] in {b"400", b"421"}
 
 
-def test_nobody_without_the_password(service: Service) -> None:
-    deployment = service.page.deployment("collect")["id"]
+def test_nobody_without_the_password(served: Service) -> None:
+    before, deployment = served.runs(), served.page.deployment("collect")["id"]
     for given in ({}, {"Authorization": basic("sliplab:guess")}, {"Authorization": "Basic \xff"}):
         for method, path, body in (
             ("POST", "/api/deployments/filter", "{}"),
@@ -127,14 +82,14 @@ def test_nobody_without_the_password(service: Service) -> None:
             ("GET", "/api/openapi.json", None),
         ):
             kind = {"Content_Type": "application/json"} if body else {}
-            assert service.ask(method, path, body, **kind, **given)[0] in {401, 403}, path
-    assert service.page.call("/flow_runs/filter", {}) == []
+            assert served.ask(method, path, body, **kind, **given)[0] in {401, 403}, path
+    assert served.runs() == before
 
 
-def test_every_route_of_prefect_is_closed(service: Service) -> None:
+def test_every_route_of_prefect_is_closed(served: Service) -> None:
     """By its own list: a new version's routes are tried, too."""
-    known = basic(service.page.password)
-    _, _, text = service.ask("GET", "/api/openapi.json", Authorization=known)
+    known = basic(served.page.password)
+    _, _, text = served.ask("GET", "/api/openapi.json", Authorization=known)
     found = json.loads(text)["paths"]
     assert len(found) > 50
     for route, methods in found.items():
@@ -143,15 +98,15 @@ def test_every_route_of_prefect_is_closed(service: Service) -> None:
             asked = method.upper(), path, None if method == "get" else "{}"
             kind = {"Content_Type": "application/json"}
             if path not in PUBLIC:
-                assert service.ask(*asked, **kind)[0] in {401, 403}, asked
+                assert served.ask(*asked, **kind)[0] in {401, 403}, asked
             sent = {**kind, "Authorization": known}
-            assert service.ask(*asked, **sent, Origin=EVIL)[0] == 403, asked
-            assert service.ask(*asked, **(sent | {"Host": "evil.example"}))[0] == 421, asked
+            assert served.ask(*asked, **sent, Origin=EVIL)[0] == 403, asked
+            assert served.ask(*asked, **(sent | {"Host": "evil.example"}))[0] == 421, asked
 
 
-def test_a_change_needs_a_token_of_its_own(service: Service) -> None:
-    known = {"Authorization": basic(service.page.password), "Content_Type": "application/json"}
-    status, _, text = service.ask("POST", "/api/deployments/filter", "{}", **known)
+def test_a_change_needs_a_token_of_its_own(served: Service) -> None:
+    known = {"Authorization": basic(served.page.password), "Content_Type": "application/json"}
+    status, _, text = served.ask("POST", "/api/deployments/filter", "{}", **known)
     assert (status, "Missing CSRF token" in text) == (403, True)
 
 
@@ -167,35 +122,35 @@ SOCKETS = (
 
 
 @pytest.mark.parametrize("path", SOCKETS)
-def test_websockets_are_as_closed(service: Service, path: str) -> None:
+def test_websockets_are_as_closed(served: Service, path: str) -> None:
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
-    path = path if service.handshake(path) == 101 else path.replace("pools", "pool")
-    assert service.handshake(path, Origin=EVIL) == 403
-    assert service.handshake(path, Host=f"evil.example:{service.port}") == 403
+    path = path if served.handshake(path) == 101 else path.replace("pools", "pool")
+    assert served.handshake(path, Origin=EVIL) == 403
+    assert served.handshake(path, Host=f"evil.example:{served.port}") == 403
     for message in ({"type": "auth", "token": "sliplab:guess"}, {"type": "auth"}, {"type": "x"}):
-        with connect(f"ws://{service.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+        with connect(f"ws://{served.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
             line.send(json.dumps(message))
             with pytest.raises(ConnectionClosed):
                 line.recv(timeout=30)
-    with connect(f"ws://{service.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
-        line.send(json.dumps({"type": "auth", "token": service.page.password}))
+    with connect(f"ws://{served.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+        line.send(json.dumps({"type": "auth", "token": served.page.password}))
         assert json.loads(line.recv(timeout=30))["type"] == "auth_success"
 
 
-def test_the_password_is_its_users_alone(service: Service) -> None:
-    file = service.store / ".prefect" / "page-password"
+def test_the_password_is_its_users_alone(served: Service) -> None:
+    file = served.store / ".prefect" / "page-password"
     found = file.stat()
     assert (stat.S_IMODE(found.st_mode), found.st_uid) == (0o600, os.getuid())
     password = file.read_text().strip()
-    assert password == service.page.password
-    reported = service.page.log.read_text()
+    assert password == served.page.password
+    reported = served.page.log.read_text()
     assert str(file) in reported
     secret = password.partition(":")[2]
     assert len(secret) > 40
     assert secret not in reported
-    for path in (path for path in service.store.rglob("*") if path.is_file() and path != file):
+    for path in (path for path in served.store.rglob("*") if path.is_file() and path != file):
         assert secret.encode() not in path.read_bytes(), path
     for line in Path("/proc").glob("[0-9]*/cmdline"):
         assert secret.encode() not in _bytes(line), line
@@ -208,34 +163,34 @@ def _bytes(path: Path) -> bytes:
         return b""
 
 
-def test_its_page_is_framed_by_nobody(service: Service) -> None:
-    status, headers, text = service.ask("GET", "/v2/", Accept="text/html")
+def test_its_page_is_framed_by_nobody(served: Service) -> None:
+    status, headers, text = served.ask("GET", "/v2/", Accept="text/html")
     assert (status, "<html" in text.lower()) == (200, True)
     assert headers["x-frame-options"] == "DENY"
-    status, _, text = service.ask("GET", "/ui-settings")
+    status, _, text = served.ask("GET", "/ui-settings")
     settings: dict[str, Any] = json.loads(text)
     assert (status, settings["auth"], settings["csrf_enabled"]) == (200, "BASIC", True)
-    assert settings["api_url"] == f"http://{service.host}/api"
+    assert settings["api_url"] == f"http://{served.host}/api"
 
 
-def test_every_run_knows_the_password_by_itself(service: Service) -> None:
-    run = service.page.run("label")
+def test_every_run_knows_the_password_by_itself(served: Service) -> None:
+    run = served.page.run("label")
     assert "id" in run, run
-    ended = service.page.ended(run["id"])
+    ended = served.page.ended(run["id"])
     assert ended["type"] == "FAILED", ended  # the store has no campaign, and the run could say so
     assert "holds no campaign" in ended["message"] or "no campaign" in ended["message"]
-    assert Store.open(service.store).campaigns() == []
+    assert Store.open(served.store).campaigns() == []
 
 
-def test_a_run_is_answered_nothing_of_files_elsewhere(service: Service) -> None:
-    run = service.page.run("collect", protocol="/proc/self/environ")
-    ended = service.page.ended(run["id"])
+def test_a_run_is_answered_nothing_of_files_elsewhere(served: Service) -> None:
+    run = served.page.run("collect", protocol="/proc/self/environ")
+    ended = served.page.ended(run["id"])
     assert ended["type"] == "FAILED"
     assert "protocol = /proc/self/environ: must be a file .yaml or .yml below " in ended["message"]
 
 
-def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Path) -> None:
-    page_server.refuse_open(service.page.url)
+def test_a_permanent_server_needs_a_password_too(served: Service, tmp_path: Path) -> None:
+    page_server.refuse_open(served.page.url)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

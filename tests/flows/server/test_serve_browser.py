@@ -7,20 +7,10 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
-from tests.flows.server.serving import Page, serving
+from tests.flows.server.serving import Service
 
 pytestmark = [needs_browser, pytest.mark.programs]
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A service with its own server."""
-    folder = tmp_path_factory.mktemp("browser")
-    rig = ROOT / "rigs" / "rehearsal.yaml"
-    with serving(folder / "store", rig, "browser", None, folder / "serve.log") as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +20,8 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("localhost", marks=pytest.mark.long)])
-def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str) -> None:
+def test_a_person_logs_in_and_runs_something(served: Service, browser: Any, host: str) -> None:
+    page = served.page
     expect = sync_api.expect
     with browser.new_context() as context:
         tab = context.new_page()
@@ -49,7 +40,7 @@ def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str
         box.fill(page.password)
         box.press("Enter")
         expect(tab.get_by_role("link", name="Deployments").first).to_be_visible()
-        before = len(page.call("/flow_runs/filter", {}))
+        before = served.runs()
         tab.goto(f"{root}/v2/deployments/deployment/{page.deployment('label')['id']}")
         for _ in range(4):  # SQLite may be written to meanwhile (503): a person presses again
             with tab.expect_response(lambda r: r.url.endswith("/create_flow_run")) as answer:
@@ -58,12 +49,13 @@ def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str
             if answer.value.status != 503:
                 break
         assert answer.value.status == 201
-        assert len(page.call("/flow_runs/filter", {})) == before + 1
+        assert served.runs() == before + 1
         assert outside == []
 
 
-def test_a_foreign_page_starts_nothing(page: Page, browser: Any) -> None:
-    before = len(page.call("/flow_runs/filter", {}))
+def test_a_foreign_page_starts_nothing(served: Service, browser: Any) -> None:
+    page = served.page
+    before = served.runs()
     run = f"{page.url}/deployments/{page.deployment('label')['id']}/create_flow_run"
     script = """async (url) => {
         const said = [];
@@ -82,4 +74,4 @@ def test_a_foreign_page_starts_nothing(page: Page, browser: Any) -> None:
         )
         tab.goto("http://evil.example/")
         assert set(tab.evaluate(script, run)) <= {"refused", 0}  # 0: an answer that is not shown
-    assert len(page.call("/flow_runs/filter", {})) == before
+    assert served.runs() == before

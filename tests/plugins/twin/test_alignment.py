@@ -30,7 +30,7 @@ from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents
 from sliplab.plugins.twin.trends import LAG, PULL, RATIO, contact_trends, plain_trend, trend
 from sliplab.storage.streams import F64, EventChunk
 from tests.plugins.twin.test_camera_estimates import pilot as seen_by_events
-from tests.plugins.twin.test_misfits import numbers
+from tests.plugins.twin.test_misfits import WAYS, numbers
 from tests.plugins.twin.test_misfits import pilot as whole_pilot
 
 Trials = Sequence[PilotTrial]
@@ -42,10 +42,8 @@ def drawn(
     worn: float = 0.0, deeper_mm: float = 0.0, friction: float = 1.0, seed: int = 0
 ) -> tuple[PilotTrial, ...]:
     """Slides in two directions at right angles, twelve of them."""
-    made = whole_pilot(
-        worn=worn, raised_mm=np.full(19, deeper_mm), friction=np.full(19, friction), seed=seed
-    )
-    return tuple(trial for k, trial in enumerate(made) if k % 4 < 2)
+    change = {"raised_mm": np.full(19, deeper_mm), "friction": np.full(19, friction)}
+    return tuple(whole_pilot(worn=worn, seed=seed, ways=WAYS[:2], **change))
 
 
 def moved(trials: Trials, shown: Callable[[F64], F64]) -> list[PilotTrial]:

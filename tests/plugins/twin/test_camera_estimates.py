@@ -142,8 +142,13 @@ def pilot() -> tuple[PilotTrial, ...]:
     )
 
 
+@cache
+def estimated() -> dict[str, float]:
+    return camera_estimates(pilot())
+
+
 def test_discs_that_sweep_give_all_numbers_of_the_picture() -> None:
-    found = camera_estimates(pilot())
+    found = estimated()
     assert found["px_per_mm"] == pytest.approx(PX_PER_MM, rel=0.002)
     assert found["marker_radius_mm"] == pytest.approx(RADIUS_MM, rel=0.01)
     assert found["image_shift_mm_per_n"] == pytest.approx(SHIFT, rel=0.01)
@@ -176,7 +181,7 @@ def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
         order = np.argsort(both.t_us, kind="stable")
         events = both[order]
         found.append(replace(made, camera=replace(made.camera, events=events)))
-    before, after = camera_estimates(pilot()), camera_estimates(found)
+    before, after = estimated(), camera_estimates(found)
     assert after["hot_pixels"] == before["hot_pixels"] == 5
     assert after["hot_hz"] == before["hot_hz"]
     assert after["noise_hz"] == pytest.approx(before["noise_hz"], rel=0.01)
@@ -371,7 +376,7 @@ def test_markers_that_are_seen_in_some_frames_only_are_enough() -> None:
         tips = made.tips_mm.copy()
         tips[: 3 + index, index % 7] = np.nan
         trials.append(replace(made, tips_mm=tips))
-    whole, found = camera_estimates(pilot()), camera_estimates(trials)
+    whole, found = estimated(), camera_estimates(trials)
     assert found == pytest.approx(whole, nan_ok=True)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -74,8 +75,9 @@ def pilot(
     spot: tuple[float, float] | None = None,
     seed: int = 0,
     worn: float = 0.0,
+    ways: Sequence[tuple[float, float]] = WAYS,
 ) -> list[PilotTrial]:
-    """Slides at three depths and two speeds in four directions, of papillae that are springs.
+    """Slides at three depths and two speeds in some directions, of papillae that are springs.
 
     Args:
         friction: of each papilla over the usual. raised_mm: height over that of its layer.
@@ -90,44 +92,49 @@ def pilot(
     mu = guess.kinetic * (1.0 if friction is None else friction)
     base = 1000 * guess.youngs_modulus_mpa / np.array([150.0, 200.0])
     found = []
-    for depth in (2.4, 2.8, 3.4):
-        for speed in SPEEDS:
-            for way in WAYS:
-                deep = depth - (guess.height_mm - height)
-                left = 1.0 - worn * len(found) / 23
-                lag, _ = steady(left * mu * np.ones(19), height, deep, *base, guess)
-                found.append(_slide(lag, depth, speed, np.array(way), ramp_mm_s2, spot, rng))
+    for number, (depth, speed, way) in enumerate(product((2.4, 2.8, 3.4), SPEEDS, WAYS)):
+        t_s = np.arange(-2.0, LENGTH_MM / speed + speed / ramp_mm_s2, 0.01) + 0.003
+        noise = _noise(rng, len(t_s))  # of all, so that those left out change no other
+        if way in ways:
+            deep = depth - (guess.height_mm - height)
+            left = 1.0 - worn * number / 23
+            lag, _ = steady(left * mu * np.ones(19), height, deep, *base, guess)
+            motion = SlideMotion(depth, speed, np.array(way))
+            found.append(_slide(lag, motion, t_s, ramp_mm_s2, spot, noise))
     return found
+
+
+def _noise(rng: np.random.Generator, count: int) -> tuple[F64, F64, F64, F64]:
+    """Draw places at rest, waves of friction along the way, their phases, and noise of tips."""
+    rest, waves = rng.normal(0.0, 0.02, LATTICE.shape), rng.normal(0.0, 0.03, (19, 8))
+    return rest, waves, rng.uniform(0.0, 6.3, (19, 8)), rng.normal(0.0, 2e-4, (count, 19, 2))
 
 
 def _slide(
     lag: F64,
-    depth: float,
-    speed: float,
-    way: F64,
+    motion: SlideMotion,
+    t_s: F64,
     ramp_mm_s2: float,
     spot: tuple[float, float] | None,
-    rng: np.random.Generator,
+    noise: tuple[F64, F64, F64, F64],
 ) -> PilotTrial:
-    t = np.arange(-2.0, LENGTH_MM / speed + speed / ramp_mm_s2, 0.01) + 0.003
-    base, end_s = base_way(t, speed, ramp_mm_s2)
-    rest = LATTICE + rng.normal(0.0, 0.02, LATTICE.shape) - 4.5 * way
-    path, now = np.zeros((len(t), 19)), np.zeros(19)
+    base, end_s = base_way(t_s, motion.speed_mm_s, ramp_mm_s2)
+    away, waves, phases, shake = noise
+    way = motion.direction
+    rest = LATTICE + away - 4.5 * way
+    path, now = np.zeros((len(t_s), 19)), np.zeros(19)
     # each papilla's friction varies along its path
-    waves = rng.normal(0.0, 0.03, (19, 8)), rng.uniform(0.0, 6.3, (19, 8))
     rate = np.linspace(1.0, 4.0, 8)
-    for k, gone in enumerate(base):
-        here = 1.0 + (waves[0] * np.cos(rate * now[:, None] + waves[1])).sum(axis=1)
+    for k in np.flatnonzero(base):
+        here = 1.0 + (waves * np.cos(rate * now[:, None] + phases)).sum(axis=1)
         if spot is not None:
             inside = np.hypot(*(rest + now[:, None] * way - spot).T) < 4.0
             here = np.where(inside, 0.6 * here, here)
-        now = np.maximum(now, gone - lag * here)
+        now = np.maximum(now, base[k] - lag * here)
         path[k] = now
-    tips = rest + path[..., None] * way + rng.normal(0.0, 2e-4, (len(t), 19, 2))
-    trial = f"{depth}-{speed}-{way}"
-    return PilotTrial(
-        trial, SlideMotion(depth, speed, way), -2.0, end_s, t, tips, base[:, None] * way
-    )
+    tips = rest + path[..., None] * way + shake
+    trial = f"{motion.depth_mm}-{motion.speed_mm_s}-{way}"
+    return PilotTrial(trial, motion, -2.0, end_s, t_s, tips, base[:, None] * way)
 
 
 def numbers(trials: Sequence[PilotTrial]) -> dict[str, float]:

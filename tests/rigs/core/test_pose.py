@@ -68,3 +68,15 @@ def test_half_way_is_half_the_line_and_half_the_turn() -> None:
     half = between(Pose((0, 0, 0), (0, 0, 0)), Pose((10, 0, -4), (0, 0, 90)), 0.5)
     assert half.xyz_mm == (5, 0, -2)
     assert half.rotvec_deg == pytest.approx((0, 0, 45))
+
+
+def test_an_angle_does_not_depend_on_the_place() -> None:
+    here = Pose((1.0, 2.0, 3.0), (0.0, 0.0, 10.0))
+    assert angle_deg(here, Pose(here.xyz_mm, (0.0, 0.0, 40.0))) == pytest.approx(30.0)
+    assert angle_deg(here, Pose((9.0, 9.0, 9.0), here.rotvec_deg)) == 0.0
+
+
+def test_of_two_quaternions_the_one_with_positive_w_is_told() -> None:
+    half = math.sqrt(0.5)
+    found = quaternion(Pose((0.0, 0.0, 0.0), (0.0, 0.0, 270.0)))
+    assert found == pytest.approx((half, 0.0, 0.0, -half))

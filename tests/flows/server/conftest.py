@@ -1,0 +1,21 @@
+"""A service that serves the tests of several files: each takes half a minute to start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.flows.server.serving import Service, serving, until
+
+
+@pytest.fixture(scope="session")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """`sliplab serve` with its own server and its page; who starts runs puts up with those."""
+    folder = tmp_path_factory.mktemp("served")
+    rig = ROOT / "rigs" / "rehearsal.yaml"
+    with serving(folder / "store", rig, "served", None, folder / "serve.log") as page:
+        found = Service(page, folder / "store")
+        until("the page", lambda: found.ask("GET", "/log")[0] == 401)
+        yield found
