@@ -46,11 +46,14 @@ if TYPE_CHECKING:
         verify,
     )
     from sliplab.flows.collecting.requests import CampaignStopped
+    from sliplab.plugins.align.align import Alignment, AlignmentRefused, align
     from sliplab.protocols.errors import InputError
     from sliplab.protocols.plan import Plan
     from sliplab.storage.errors import StoreError
 
 __all__ = [
+    "Alignment",
+    "AlignmentRefused",
     "CampaignStopped",
     "Events",
     "InputError",
@@ -64,6 +67,7 @@ __all__ = [
     "Trial",
     "WindowCounts",
     "__version__",
+    "align",
     "check",
     "collect",
     "export",
@@ -76,10 +80,13 @@ __all__ = [
 __version__: str
 
 _ELSEWHERE = {
+    "Alignment": "sliplab.plugins.align.align",
+    "AlignmentRefused": "sliplab.plugins.align.align",
     "CampaignStopped": "sliplab.flows.collecting.requests",
     "InputError": "sliplab.protocols.errors",
     "Plan": "sliplab.protocols.plan",
     "StoreError": "sliplab.storage.errors",
+    "align": "sliplab.plugins.align.align",
 }
 
 
