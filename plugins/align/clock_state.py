@@ -23,7 +23,7 @@ Bools = NDArray[np.bool_]
 _RATES = 10.0 ** np.arange(-2.0, 10.5, 0.5)
 _WANDER = 0.3e-6 / 1e9**0.5
 """Largest random walk of the drift, per square root of ns: 0.3 ppm in a second, 18 in an hour."""
-_STRAIGHT = 0.7
+_STRAIGHT = 0.9
 """Prior probability of a clock that wanders too little to be seen."""
 _FEW = 12
 """A clock with fewer events is taken not to wander."""
