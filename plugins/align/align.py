@@ -42,7 +42,7 @@ _MOST_OUTSIDE = 0.4
 """Largest share of a stretch's pairs that may lie off its line."""
 _BETWEEN = 8
 """Up to so many unpaired events between two stretches, the clock jumped once there."""
-_JUMP, _DOUBT = 12.0, 6.0
+_JUMP, _DOUBT = 12.0, 5.0
 """Log-likelihood that a jump gains, to be one or to be in doubt: chance gives the first once in
 about a million places."""
 _NEAR = 64
@@ -420,13 +420,16 @@ class _Fit:
         for k, part in enumerate(parts):
             lower = self._open_end(part, False) if k == 0 else None
             upper = self._open_end(part, True) if k == len(parts) - 1 else None
+            # where not all is explained, a jump back may hide next to the outermost event
             if k:
-                lower = self._ns(part, 0)
+                lower = self._ns(part, 1)
                 if jumps[k - 1].certain:
+                    lower = self._ns(part, 0)
                     lower = min(jumps[k - 1].after_ns, lower - self._between(parts[k - 1], part))
             if k < len(jumps):
-                upper = self._ns(part, -1)
+                upper = self._ns(part, -2)
                 if jumps[k].certain:
+                    upper = self._ns(part, -1)
                     upper = max(jumps[k].before_ns, upper + self._between(part, parts[k + 1]))
             # what lies at the lists' ends is not confirmed by what follows
             first = min(_UNCONFIRMED, part.run.a.size // 4) if k == 0 else 0
@@ -511,21 +514,19 @@ class _Fit:
         score = before + behind
         likely = np.flatnonzero(score >= score.max() - _UNLIKELY)
         first, last = low + int(likely[0]), low + int(likely[-1])
-        # what fits neither line lies between
-        best = int(score.argmax())
-        fits = np.concatenate([scores[0][:best], scores[1][best:]]) > 0
-        unpaired = (~fits).sum() - _EXPECTED * fits.size
         kept = [
             self._part(one.piece, _until(one.run, first), one.outliers),
             self._part(two.piece, _from(two.run, last), two.outliers),
         ]
         after, upto = max(first - 1, int(kept[0].run.a[-1])), min(last, int(kept[1].run.a[0]))
+        # what fits neither line lies between
+        unpaired = int((np.maximum(*scores)[after - low + 1 : upto - low] <= 0).sum())
         return (
             Jump(
                 self.origin_a + int(self.x[after]),
                 self.origin_a + int(self.x[upto]),
                 size,
-                bool(unpaired <= _BETWEEN),
+                unpaired <= _BETWEEN,
             ),
             kept,
         )

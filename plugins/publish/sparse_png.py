@@ -26,6 +26,8 @@ _LENGTHS = np.array(
 )  # fmt: skip
 """Shortest match of each length code from 257 on."""
 _EXTRA = np.array([0] * 8 + [k for k in range(1, 6) for _ in range(4)] + [0], np.int64)
+_WHOLE = 0b10100011
+"""A match of 258 at distance 1, its bits in the order of the stream, the first one lowest."""
 _ADLER = 65_521
 
 
@@ -66,11 +68,18 @@ def _deflated(places: I64, values: U8, size: int, lengths: I64, extra: I64) -> U
             run -= 1
             black = True
         while run > 0:
+            if run >= 258:  # most of the image: both codes in one go, 13 bits
+                word = _WHOLE << (at & 7)
+                out[at >> 3] |= word & 255
+                out[(at >> 3) + 1] |= word >> 8
+                at += 13
+                run -= 258
+                continue
             if run < 3:
                 at = _literal(out, at, 0)
                 run -= 1
                 continue
-            length = min(run, 258)
+            length = run
             code = np.searchsorted(lengths, length, side="right") - 1
             short = code < 23
             at = _code(out, at, code + 1 if short else 0b11000000 + code - 23, 7 if short else 8)
