@@ -20,6 +20,7 @@ NAMES = (
     "scene",
     "clocks",
     "clock_kinds",
+    "align",
     "labels",
     "labels_truth",
     "network",

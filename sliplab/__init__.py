@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         verify,
     )
     from sliplab.flows.collecting.requests import CampaignStopped
+    from sliplab.plugins.align.align import Alignment, AlignmentRefused, align
     from sliplab.plugins.record.recorder import record
     from sliplab.plugins.record.sources import columns, lsl, push, usb_camera
     from sliplab.protocols.errors import InputError
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
     from sliplab.storage.errors import StoreError
 
 __all__ = [
+    "Alignment",
+    "AlignmentRefused",
     "CampaignStopped",
     "Events",
     "InputError",
@@ -66,6 +69,7 @@ __all__ = [
     "Trial",
     "WindowCounts",
     "__version__",
+    "align",
     "check",
     "collect",
     "columns",
@@ -88,10 +92,13 @@ _ELSEWHERE = {
     "push": "sliplab.plugins.record.sources",
     "record": "sliplab.plugins.record.recorder",
     "usb_camera": "sliplab.plugins.record.sources",
+    "Alignment": "sliplab.plugins.align.align",
+    "AlignmentRefused": "sliplab.plugins.align.align",
     "CampaignStopped": "sliplab.flows.collecting.requests",
     "InputError": "sliplab.protocols.errors",
     "Plan": "sliplab.protocols.plan",
     "StoreError": "sliplab.storage.errors",
+    "align": "sliplab.plugins.align.align",
 }
 
 

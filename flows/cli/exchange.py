@@ -9,6 +9,7 @@ import typer
 
 from sliplab.flows.cli.common import DATA, JsonOption, StoreOption, finish
 from sliplab.flows.running import console, exit_codes
+from sliplab.protocols.errors import InputError
 
 app = typer.Typer()
 
@@ -51,6 +52,10 @@ def import_(
         bool,
         typer.Option("--salvage", help="Import the undamaged beginning of a damaged file."),
     ] = False,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Import files of a folder as their writer closes them."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Import recordings of other programs into a new campaign; unknown values are marked.
@@ -63,6 +68,15 @@ def import_(
     from sliplab.flows.imports import import_data
 
     source = Path(kind_or_path) if path is None else path
+    if watch:
+        if adapter is not None or dry_run:
+            raise InputError("--watch", "", None, "cannot be given with --adapter or --dry-run")
+        from sliplab.flows.folder_watch import watch as run_watch
+
+        kind = None if path is None else kind_or_path
+        found = run_watch(source, store, name, kind, simulated=simulated, salvage=salvage)
+        finish(found, f"imported into {store}", as_json)
+        return
     result = import_data(
         source,
         store,

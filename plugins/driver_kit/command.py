@@ -32,7 +32,10 @@ def driver(
     ],
     kind: Annotated[
         str,
-        typer.Option("--kind", help="Kind of device: arm, events, frames, sync, force or gripper."),
+        typer.Option(
+            "--kind",
+            help="Kinds of device, with commas: arm, events, frames, sync, force, gripper.",
+        ),
     ] = "arm",
     into: Annotated[
         Path, typer.Option("--into", help="Folder in which the package's own folder is made.")
@@ -40,19 +43,28 @@ def driver(
     as_json: JsonOption = False,
 ) -> None:
     """Write a package with a driver that works on its fake, and a test of SlipLab's rules."""
-    from sliplab.plugins.driver_kit.new_package import KINDS, name_fault, write_package
+    from sliplab.plugins.driver_kit.new_package import (
+        KINDS,
+        driver_names,
+        name_fault,
+        write_package,
+    )
 
-    if kind not in KINDS:
-        raise InputError("--kind", "", kind, one_of(kind, KINDS))
-    if fault := name_fault(name):
-        raise InputError("NAME", "", name, fault)
+    kinds = [part.strip() for part in kind.split(",")]
+    for one in kinds:
+        if one not in KINDS or kinds.count(one) > 1:
+            raise InputError("--kind", "", one, one_of(one, KINDS) + ", each once")
+    drivers = driver_names(name, kinds)
+    for driver_name in drivers:
+        if fault := name_fault(driver_name):
+            raise InputError("NAME", "", driver_name, fault)
     folder = into / name.replace("_", "-")
     if folder.exists():
         raise InputError("FOLDER", "", folder, "exists already and is not overwritten")
     try:
-        written = write_package(folder, name, kind)
+        written = write_package(folder, name, kinds)
     except OSError as error:
         text = f"cannot be written: {error.strerror}"
         raise InputError("FOLDER", "", folder, text) from None
-    result = {"driver": name, "kind": kind, "folder": str(folder), "files": written}
+    result = {"driver": ", ".join(drivers), "kind": kind, "folder": str(folder), "files": written}
     finish(result, f"new driver {name}", as_json)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from collections.abc import Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,21 +41,21 @@ dependencies = ["sliplab"]
 dev = ["pytest>=9"]
 
 [project.entry-points."sliplab.drivers"]
-$name = "$name:DRIVER"
+$entries
 
 [tool.setuptools]
-packages = ["$name"]
+packages = [$packages]
 """)
 
 README = Template("""\
-# $name
+# $title
 
 A driver for SlipLab. It runs unchanged, on a fake of a device that does not exist.
 
 ```sh
 pip install -e .[dev]
 pytest                       # the rules that SlipLab holds a driver of this kind to
-sliplab rigs --drivers       # lists $name
+sliplab rigs --drivers       # lists $title
 sliplab rigs rig.yaml        # reads the rig file that uses it
 ```
 
@@ -71,11 +72,12 @@ Write down here what was never tried on the device itself.
 """)
 
 RIG = Template("""\
-# The loopback rig with $name, on its fake: all that it stores is simulated.
+# The loopback rig with $title:
+# on fakes, so all that it stores is simulated.
 extends: loopback
 name: $project-loopback
 devices:
-  $key: {driver: $name$device}
+$devices
 $more""")
 _IN_RIG = {
     "arm": (
@@ -127,30 +129,69 @@ def name_fault(name: str) -> str:
     return ""
 
 
-def package_files(name: str, kind: str) -> dict[str, str]:
+def driver_names(name: str, kinds: Sequence[str]) -> list[str]:
+    """Return the names of a package's drivers: its own, or with several kinds one for each."""
+    return [name] if len(kinds) == 1 else [f"{name}_{kind}" for kind in kinds]
+
+
+def package_files(name: str, kinds: Sequence[str]) -> dict[str, str]:
     """Return the text of each file of a new package, by its path.
 
     Args:
-        name: of the driver and its package.
-        kind: one of `KINDS`.
+        name: of the package, and of its driver if there is one.
+        kinds: of `KINDS`, each once.
     """
+    drivers = driver_names(name, kinds)
+    inside = [_IN_RIG.get(kind, ("", "")) for kind in kinds]
+    words = {
+        "project": name.replace("_", "-"),
+        "title": " and ".join(drivers),
+        "entries": "\n".join(f'{driver} = "{driver}:DRIVER"' for driver in drivers),
+        "packages": ", ".join(f'"{driver}"' for driver in drivers),
+        "devices": "\n".join(
+            f"  {KINDS[kind]}: {{driver: {driver}{device}}}"
+            for kind, driver, (device, _) in zip(kinds, drivers, inside, strict=True)
+        ),
+        "more": _joined([more for _, more in inside]),
+    }
+    found = {
+        "pyproject.toml": PYPROJECT.substitute(words),
+        "README.md": README.substitute(words, name=name if len(kinds) == 1 else f"{name}_KIND"),
+        "rig.yaml": RIG.substitute(words),
+    }
+    for driver, kind in zip(drivers, kinds, strict=True):
+        found |= _driver_files(driver, kind)
+    return found
+
+
+def _joined(entries: Sequence[str]) -> str:
+    """Join further entries of a rig file, `mock:` once."""
+    lines = [line for text in entries for line in text.splitlines()]
+    simulated = [line for line in lines if line.startswith("mock: ")]
+    rest = [line for line in lines if line not in simulated]
+    if len(simulated) > 1:
+        # a block, with each device's own comment
+        rest.append("mock:")
+        for line in simulated:
+            entry, hash_, comment = line.removeprefix("mock: {").partition("#")
+            entry = entry.rstrip().removesuffix("}")
+            rest.append(f"  {entry}   {hash_}{comment}".rstrip())
+    else:
+        rest += simulated
+    return "".join(f"{line}\n" for line in rest)
+
+
+def _driver_files(name: str, kind: str) -> dict[str, str]:
+    """Return the module of one driver and its test."""
     class_name = "".join(part.capitalize() for part in name.split("_"))
     example = f"Example{kind.capitalize()}"
-    device, rest = _IN_RIG.get(kind, ("", ""))
     words = {
         "name": name,
-        "project": name.replace("_", "-"),
-        "key": KINDS[kind],
         "settings": f"{class_name}Settings",
         "more": ", free_port" if kind == "arm" else "",
         "arguments": _ARGUMENTS.get(kind, ""),
     }
-    found = {
-        "pyproject.toml": PYPROJECT.substitute(words),
-        "README.md": README.substitute(words),
-        "rig.yaml": RIG.substitute(words, device=device, more=rest),
-        f"tests/test_{name}.py": TEST.substitute(words),
-    }
+    found = {f"tests/test_{name}.py": TEST.substitute(words)}
     for module in ("__init__", "driver", "fake"):
         text = (files(_EXAMPLES) / kind / f"{module}.py").read_text()
         text = text.replace(f"{_EXAMPLES}.{kind}", name)
@@ -177,7 +218,7 @@ def _own_imports_last(text: str, package: str) -> str:
     return f"{rest[:end]}\n{own}{rest[end:]}"
 
 
-def write_package(folder: Path, name: str, kind: str) -> list[str]:
+def write_package(folder: Path, name: str, kinds: Sequence[str]) -> list[str]:
     """Write a new package into a folder that does not exist yet; return its files.
 
     Raises:
@@ -185,7 +226,7 @@ def write_package(folder: Path, name: str, kind: str) -> list[str]:
         OSError: it cannot be written.
     """
     folder.mkdir(parents=True)
-    texts = package_files(name, kind)
+    texts = package_files(name, kinds)
     for path, text in texts.items():
         (folder / path).parent.mkdir(exist_ok=True)
         (folder / path).write_text(text)

@@ -1,5 +1,8 @@
 """Trials as episodes of a LeRobot v3 data set: rows on a fixed time grid, with the raw trials.
 
+Rows have the times of a grid; the true ones are features of their own: ``time_ns``, and
+``frame_time_ns`` of the frame that a row has.
+
 Layout: ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet``, ``meta/episodes/`` and
 ``data/``, all Parquet of chunk-NNN/file-NNN. A row covers 1/100 s of the trial's time line and has
 the values known at its end. Frames and counts of events are PNG inside of Parquet: LeRobot's videos
@@ -8,7 +11,7 @@ are lossy. A feature is there if every trial has it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,10 +25,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplab.plugins.publish.publication import SPLITS, Publication
+from sliplab.plugins.publish.sparse_png import sparse_png
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json_aside
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, I64, U8, WRENCH, Json
+from sliplab.storage.streams import EVENTS_KIND, I64, WRENCH, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
@@ -34,6 +38,7 @@ VERSION, FPS = "v3.0", 100
 STEP_NS = 1_000_000_000 // FPS
 EVENTS, FRAMES = "observation.images.events", "observation.images.frames"
 STATE, SLIP = "observation.state", "slip"
+TIME, FRAME_TIME = "time_ns", "frame_time_ns"
 _CHUNK = 1000
 """Files of a folder."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -44,6 +49,7 @@ _PLAIN = {
     "index": "int64",
     "task_index": "int64",
     SLIP: "int64",
+    TIME: "int64",
 }
 _POSE = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
 _WRENCH = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
@@ -85,11 +91,10 @@ class _Levels:
     histogram: I64
     images: int = 0
 
-    def add(self, image: U8) -> None:
-        """Add one image, shape (height, width, channels)."""
-        for channel, levels in enumerate(np.moveaxis(image, 2, 0)):
-            self.histogram[channel] += np.bincount(levels.reshape(-1), minlength=256)
-        self.images += 1
+    def add(self, histogram: I64, images: int = 1) -> None:
+        """Add the levels of one image, shape (channels, 256), as often as it comes."""
+        self.histogram += histogram * images
+        self.images += images
 
     def to_json(self) -> Json:
         """Return the figures of levels from 0 to 1, shape (channels, 1, 1)."""
@@ -180,6 +185,7 @@ def _features(recordings: list[Recording]) -> tuple[dict[str, Json], tuple[str, 
         if len(frame_px) == 1:
             ((height, width),) = frame_px
             features[FRAMES] = _pictures((width, height), 1)
+            features[FRAME_TIME] = {"dtype": "int64", "shape": [1], "names": None}
     return features, tuple(sorted(shared))
 
 
@@ -206,6 +212,7 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
         "index": made.rows + np.arange(count),
         "task_index": np.full(count, task),
         SLIP: _slip(store, campaign, recording, ends),
+        TIME: ends,
     }
     vectors: dict[str, Array] = {}
     if STATE in made.features:
@@ -220,18 +227,23 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
         vectors[f"observation.{name}"] = _at(
             ends, times, np.hstack([found.force_n, found.torque_nm])
         )
+    if EVENTS in made.features:
+        shape = tuple(made.features[EVENTS]["shape"])
+        columns[EVENTS] = _event_images(made, recording, shape, start, count)
+    if FRAMES in made.features:
+        times = np.asarray(recording.frame_times())
+        # the first one where there is none yet
+        shown = np.maximum(np.searchsorted(times, ends, "right") - 1, 0)
+        columns[FRAMES] = _frame_images(made, recording, shown)
+        plain[FRAME_TIME] = times[shown]
     for name, values in plain.items():
-        columns[name] = pa.array(values, pa.from_numpy_dtype(np.dtype(_PLAIN[name])))
+        dtype = np.dtype(made.features[name]["dtype"])
+        columns[name] = pa.array(values, pa.from_numpy_dtype(dtype))
         made.figures(name).add(values[:, None])
     for name, rows in vectors.items():
         flat = pa.array(rows.astype(np.float32).reshape(-1))
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, rows.shape[1])
         made.figures(name).add(rows)
-    if EVENTS in made.features:
-        shape = tuple(made.features[EVENTS]["shape"])
-        columns[EVENTS] = _packed(made, EVENTS, _counts(recording, shape, start, count))
-    if FRAMES in made.features:
-        columns[FRAMES] = _packed(made, FRAMES, _shown(recording, ends))
     place = {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
     path = made.folder / _file("data", **place)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -322,42 +334,42 @@ def _turned(ends: I64, times: I64, rotvec_deg: Array) -> Array:
     return np.asarray(Slerp(known, rotations)(at).as_rotvec(degrees=True))
 
 
-def _counts(recording: Recording, shape: tuple[int, ...], start: int, count: int) -> Iterator[U8]:
-    """Yield counts of events of each row: brighter, darker, 0; at most 255."""
+def _event_images(
+    made: _Set, recording: Recording, shape: tuple[int, ...], start: int, count: int
+) -> pa.Array:
+    """Pack counts of events of each row: brighter, darker, 0; at most 255."""
     clock = recording.clock(EVENTS_KIND)
     events = recording.events()
     rows = (np.asarray(clock.to_reference(events.t_us * 1000)) - start) // STEP_NS
     edges = np.searchsorted(rows, np.arange(count + 1)).tolist()
+    height, width, channels = shape
+    packed, levels = [], made.levels(EVENTS)
     for low, high in pairwise(edges):
         part = slice(low, high)
         pixels = (events.y[part].astype(np.int64), events.x[part], 1 - events.p[part].astype(int))
         seen, counted = np.unique(np.ravel_multi_index(pixels, shape), return_counts=True)
-        found = np.zeros(shape, np.uint8)
-        found.reshape(-1)[seen] = np.minimum(counted, 255)
-        yield found
+        counted = np.minimum(counted, 255).astype(np.uint8)
+        found = np.bincount((seen % channels) * 256 + counted, minlength=channels * 256)
+        found = found.reshape(channels, 256)
+        found[:, 0] = height * width - found[:, 1:].sum(1)
+        levels.add(found)
+        packed.append({"bytes": sparse_png(seen, counted, height, width), "path": None})
+    return pa.array(packed, _IMAGE)
 
 
-def _shown(recording: Recording, ends: I64) -> Iterator[U8]:
-    """Yield the last frame before the end of each row; the first one where there is none yet."""
-    times = recording.frame_times()
-    wanted = np.maximum(np.searchsorted(times, ends, "right") - 1, 0).tolist()
+def _frame_images(made: _Set, recording: Recording, shown: I64) -> pa.Array:
+    """Pack the frame of each row; one that several rows have is encoded once."""
+    packed, levels = [], made.levels(FRAMES)
     at, frames = 0, recording.frames()
     image = next(frames)
-    for number in wanted:
+    for number, rows in zip(*np.unique(shown, return_counts=True), strict=True):
         while at < number:
             image, at = next(frames), at + 1
-        yield image[..., None]
-
-
-def _packed(made: _Set, name: str, images: Iterator[U8]) -> pa.Array:
-    packed, levels = [], made.levels(name)
-    for image in images:
-        levels.add(image)
-        # OpenCV takes colours as blue, green, red
-        done, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+        levels.add(np.bincount(image.reshape(-1), minlength=256)[None], int(rows))
+        done, data = cv2.imencode(".png", image)
         if not done:
             raise RuntimeError("OpenCV cannot write PNG")
-        packed.append({"bytes": data.tobytes(), "path": None})
+        packed += [{"bytes": data.tobytes(), "path": None}] * int(rows)
     return pa.array(packed, _IMAGE)
 
 

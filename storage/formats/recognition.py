@@ -54,6 +54,8 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _RESERVED = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?")
 """Names that no file has on Windows."""
 _LONGEST_NAME, _HASH = 200, 8
+Wanted = tuple[str, Files]
+"""Name of a trial, and its files."""
 
 
 def kind_of(path: Path) -> str:
@@ -117,8 +119,24 @@ def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[Forei
             found = _opened(_single(file, of), item["trial"], salvage)
             yield _as_exported(found, item, manifest["simulated"])
         return
-    laid_out = layouts()
     wanted = _sort(path) if kind == MIXED else _of_kind(path, kind)
+    yield from trials_of(path, wanted, salvage=salvage)
+
+
+def recordings_in(path: Path, kind: str) -> list[Wanted]:
+    """Return the recordings in a folder by name, or none.
+
+    Raises:
+        InputError: the folder is one data set.
+    """
+    if _data_set(path) is not None or _is_recording(path):
+        raise InputError(path, "", None, "is one recording or data set; give the folder around it")
+    return [item for item in _sort(path) if kind in (MIXED, item[1].kind)]
+
+
+def trials_of(path: Path, wanted: Sequence[Wanted], *, salvage: bool) -> Iterator[ForeignTrial]:
+    """Yield the trials of recordings in a file or folder; arguments as in `trials_in`."""
+    laid_out = layouts()
     for _, each in wanted:
         if (check := known_format(each.kind).check) is not None:
             check(each.files[0])
@@ -175,10 +193,6 @@ def _reason(entry: Path, other: str) -> str:
     if not entry.is_file():
         return "is no regular file"
     return unread(entry) or other
-
-
-Wanted = tuple[str, Files]
-"""Name of a trial, and its files."""
 
 
 def _sort(path: Path) -> list[Wanted]:

@@ -19,6 +19,7 @@ TINY: dict[str, dict[str, Any]] = {
     "scene": {"length_mm": 1.0, "runs": 1, "trials": 0, "grid": 8},
     "clocks": {"trains": 3},
     "clock_kinds": {"trains": 2},
+    "align": {"trials": 2},
     "labels": {"frames": 5, "runs": 1},
     "orchestration": {"trials": 30, "runs": 1, "records": 50, "starts": 0, "long": 40},
     "acquisition": {"seconds": 0.5, "events_per_s": 100_000, "size": 96, "pictures": 4}
@@ -40,6 +41,8 @@ PROMISED = {
     | {f"{rival}_worst_error_us" for rival in ("index", "nearest", "pyxdf")},
     "clock_kinds": {"good_wrong", "good_refused_share", "good_coverage_95", "other_trial_wrong"}
     | {"jump_1ms_at_end_wrong", "lost_30_on_both_refused_share", "kink_0.2ppm_coverage_95"},
+    "align": {f"{kind}_{name}" for kind in ("harp", "random", "code") for name in ("coverage",)}
+    | {"harp_wrong", "random_refused", "code_pyxdf_error_us"},
     "acquisition": {"frames_lost", "events_lost", "pulses_lost", "memory_growth_mb"}
     | {"saturation_x_realtime", "encode_s_per_trial", "frames_per_s"}
     | {"dropped_on_purpose", "dropped_noticed"},

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +58,36 @@ def test_it_writes_what_it_says(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_of_the_example_is_left_and_every_module_compiles(kind: str) -> None:
-    for path, text in package_files("lab_thing", kind).items():
+    for path, text in package_files("lab_thing", [kind]).items():
         assert "xample" not in text, path
         assert "sliplab.plugins.driver_kit" not in text, path
         if path.endswith(".py"):
             compile(text, path, "exec")
         assert max(map(len, text.splitlines())) <= 100, path
+
+
+def test_several_kinds_are_drivers_of_one_package() -> None:
+    made = package_files("lab", ["arm", "force", "gripper"])
+    project = tomllib.loads(made["pyproject.toml"])
+    drivers = {f"lab_{kind}": f"lab_{kind}:DRIVER" for kind in ("arm", "force", "gripper")}
+    assert project["project"]["entry-points"]["sliplab.drivers"] == drivers
+    assert project["tool"]["setuptools"]["packages"] == list(drivers)
+    rig = yaml.safe_load(made["rig.yaml"])
+    assert [device["driver"] for device in rig["devices"].values()] == list(drivers)
+    assert rig["mock"] == {
+        "arm": {"start_xyz_mm": [397, 0, 300]},
+        "force": {},
+        "gripper": {"opening_mm": 40},
+    }
+    assert {f"{name}/driver.py" for name in drivers} | {
+        f"tests/test_{name}.py" for name in drivers
+    } < made.keys()
+
+
+def test_a_kind_given_twice_is_refused(tmp_path: Path) -> None:
+    done = here("new", "driver", "lab", "--kind", "arm,arm", "--into", tmp_path)
+    assert done.returncode == 2
+    assert "each once" in done.stderr
 
 
 @pytest.mark.parametrize(

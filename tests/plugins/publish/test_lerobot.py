@@ -111,6 +111,9 @@ def test_every_row_is_what_the_store_has(store: Store, published: Path) -> None:
         assert expected.sum() == 1000
         np.testing.assert_array_equal(images, expected)
         levels, times = list(trial.frames()), trial.frame_times()
+        np.testing.assert_array_equal(rows["time_ns"].to_numpy(), ends)
+        shown = rows["frame_time_ns"].to_numpy()
+        np.testing.assert_array_equal(shown, times[np.searchsorted(times, ends, "right") - 1])
         for image, end in zip(_images(rows["observation.images.frames"]), ends, strict=True):
             np.testing.assert_array_equal(image, levels[np.flatnonzero(times <= end)[-1]])
         state = np.array(rows["observation.state"].to_pylist())

@@ -1,0 +1,103 @@
+"""`sliplab align`: two clocks by events that both saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sliplab.flows.cli.common import DATA, JsonOption, finish
+from sliplab.flows.running import console, exit_codes
+
+app = typer.Typer()
+
+
+@app.command(
+    "align",
+    rich_help_panel=DATA,
+    epilog="Example: sliplab align camera.csv robot.csv --map grasps.csv --out on-robot.csv",
+)
+def align_(
+    a: Annotated[Path, typer.Argument(metavar="A.csv", help="Event times on clock A.")],
+    b: Annotated[
+        str, typer.Argument(metavar="B.csv", help="The same events on clock B; or `harp`.")
+    ],
+    offset: Annotated[
+        float | None,
+        typer.Option("--offset", help="B less A at A's first event, s; for regular pulses, taps."),
+    ] = None,
+    within: Annotated[
+        float, typer.Option("--within", help="By how much --offset may be wrong, s.")
+    ] = 0.1,
+    drift: Annotated[
+        float, typer.Option("--max-drift-ppm", help="Largest difference of the clocks' rates.")
+    ] = 500.0,
+    unit: Annotated[
+        str | None,
+        typer.Option("--unit", help="s, ms, us or ns; default: the column's name (time_ms), or s."),
+    ] = None,
+    harp: Annotated[
+        bool,
+        typer.Option("--harp", help="Edges (time, state) of a Harp clock's 1 kbaud output."),
+    ] = False,
+    times: Annotated[
+        Path | None, typer.Option("--map", help="CSV of times on A to map; default: A's events.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="CSV of the mapped times to write, in ns.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit the map between two clocks by events that both saw, with intervals, or refuse.
+
+    Events are paired by ids (column id), by --offset, or by their pattern: random intervals or a
+    code. Missing and spurious events, drift and jumps are found.
+    """
+    from sliplab.plugins.align.align import AlignmentRefused, align
+    from sliplab.plugins.align.events import events_from
+
+    try:
+        found = align(
+            a,
+            b,
+            offset_s=offset,
+            within_s=within,
+            max_drift_ppm=drift,
+            unit=unit,
+            harp=harp,
+        )
+    except AlignmentRefused as refusal:
+        if as_json:
+            console.print_json({"refused": refusal.reason, "message": str(refusal)})
+        console.say(f"refused: {refusal.reason}: {refusal}")
+        raise typer.Exit(exit_codes.FAILED) from None
+    result = found.to_json()
+    if out is not None:
+        # Harp words among A's edges are its events, not the edges
+        asked = events_from(times or a, "times", unit, harp=harp and times is None).ns
+        mapped = found.map(asked)
+        mapped.write(asked, out)
+        result |= {"written": str(out), "times": asked.size, "unknown": int((~mapped.known).sum())}
+    finish(result if as_json else _pairs(result), f"{a} to {b}", as_json)
+
+
+def _pairs(result: dict[str, Any]) -> dict[str, Any]:
+    shown: dict[str, Any] = {
+        "paired by": result["paired_by"],
+        "events": f"{result['events_a']} and {result['events_b']}",
+    }
+    for number, part in enumerate(result["stretches"], 1):
+        seconds = (part["last_ns"] - part["first_ns"]) / 1e9
+        shown[f"stretch {number}"] = (
+            f"{part['events']} pairs in {seconds:.1f} s: B = A + {part['offset_ns'] / 1e9:.9f} s "
+            f"± {part['half_ns'] / 1e3:.1f} us (95 %) at A = {part['middle_ns'] / 1e9:.3f} s, rate "
+            f"{part['rate_ppm']:+.3f} ppm, scatter {part['scatter_ns'] / 1e3:.1f} us"
+        )
+    for number, jump in enumerate(result["jumps"], 1):
+        shown[f"jump {number}"] = (
+            f"{jump['size_ns'] / 1e9:+.6f} s between A = {jump['after_ns'] / 1e9:.3f} and "
+            f"{jump['before_ns'] / 1e9:.3f} s"
+        )
+    shown |= {key: result[key] for key in ("written", "times", "unknown") if key in result}
+    return shown

@@ -1,0 +1,192 @@
+"""The map between two clocks by events that both saw."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sliplab
+from benchmarks.align import KINDS, make_trial
+from sliplab import AlignmentRefused, InputError
+from sliplab.plugins.align.align import UNKNOWN
+from sliplab.plugins.align.events import events_from
+from sliplab.storage.streams import F64
+from tests.command_line import here
+
+RNG = 4
+
+
+def _random_events(n: int = 200, seed: int = RNG) -> F64:
+    rng = np.random.default_rng(seed)
+    return np.cumsum(rng.uniform(0.2, 1.8, n))
+
+
+def _regular() -> tuple[F64, F64]:
+    rng = np.random.default_rng(RNG)
+    b = np.arange(100.0)
+    a = b * (1 + 60e-6) - 1000.0
+    return a[5:] + rng.normal(0, 20e-6, 95), b[:90]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_intervals_hold_and_jumps_are_placed(kind: str) -> None:
+    rng = np.random.default_rng(RNG)
+    held, far = [], 0
+    for _ in range(12):
+        trial = make_trial(kind, rng, jumps=1)
+        found = sliplab.align(trial.a, trial.b, harp=kind == "harp")
+        instants = np.linspace(trial.pair_b[0], trial.pair_b[-1], 50)
+        true = np.rint(instants).astype(np.int64)
+        mapped = found.map(trial.clock.at(instants))
+        at = mapped.within
+        half = (mapped.high_ns - mapped.low_ns) / 2
+        far += int((np.abs(mapped.ns - true) > 3 * half)[at].sum())
+        held.append(((mapped.low_ns <= true) & (true <= mapped.high_ns))[at].mean())
+        for jump in found.jumps:
+            when, size = trial.clock.jumps[0]
+            assert jump.size_ns == pytest.approx(-size, abs=1e5)
+            low, high = sorted((jump.after_ns, jump.before_ns))
+            there = trial.clock.at(np.array([when, when + 1.0]))
+            assert low <= there.max()
+            assert there.min() <= high
+    assert far == 0
+    assert np.mean(held) > 0.85
+
+
+def test_events_of_another_session_are_refused() -> None:
+    with pytest.raises(AlignmentRefused) as refused:
+        sliplab.align(_random_events(seed=1), _random_events(seed=2))
+    assert refused.value.reason in {"ambiguous", "no_match"}
+
+
+def test_regular_pulses_are_ambiguous_without_an_offset() -> None:
+    a, b = _regular()
+    with pytest.raises(AlignmentRefused, match="or give an approximate offset"):
+        sliplab.align(a, b)
+    with pytest.raises(AlignmentRefused, match=r"events of B come 1 s apart.*0\.6"):
+        sliplab.align(a, b, offset_s=1000.0, within_s=0.6)
+    found = sliplab.align(a, b, offset_s=1000.1, within_s=0.3)
+    assert found.by == "offset"
+    assert found.stretches[0].rate_ppm == pytest.approx(-60, abs=1)
+    mapped = found.map(np.array([-950.0]))
+    assert mapped.ns[0] == pytest.approx(50e9 * (1 - 60e-6), abs=3e4)
+    assert mapped.low_ns[0] < mapped.ns[0] < mapped.high_ns[0]
+
+
+def test_few_taps_align_by_an_offset() -> None:
+    taps = np.array([1.0, 2.3, 4.1, 7.7, 9.2, 12.0])
+    noise = np.random.default_rng(RNG).normal(0, 1e-3, 6)
+    found = sliplab.align(taps + 50.0, np.append(taps + noise, 14.0), offset_s=-50.0, within_s=0.2)
+    assert found.stretches[0].events == 6
+    mapped = found.map(np.array([56.0]))
+    assert mapped.low_ns[0] < 6e9 < mapped.high_ns[0]
+
+
+def test_ids_pair_events_and_bad_ones_are_left_out() -> None:
+    times = np.arange(60) * 30.0
+    ids = np.arange(60) + 7
+    other = ids.copy()
+    other[10] = 50
+    b = times * (1 - 40e-6) + np.random.default_rng(RNG).normal(0, 1e-5, 60)
+    found = sliplab.align((times + 5.0, ids), (b, other))
+    assert found.by == "ids"
+    assert found.stretches[0].rate_ppm == pytest.approx(-40, abs=0.2)
+
+
+def test_seconds_of_a_harp_clock_are_its_times() -> None:
+    trial = make_trial("harp", np.random.default_rng(RNG), jumps=0)
+    words = events_from(trial.a, "a", harp=True)
+    found = sliplab.align(trial.a, "harp", harp=True)
+    mapped = found.map(words.ns)
+    assert np.abs(mapped.ns - words.ids * 10**9).max() < 300_000
+
+
+def test_clock_that_falls_back_maps_to_an_interval_that_contains_both_times() -> None:
+    b = _random_events(400)
+    a = b.copy()
+    a[200:] -= 5.0
+    found = sliplab.align(a, b)
+    assert len(found.jumps) == 1
+    mapped = found.map(a[[50, 198, 201, 350]])
+    for true, low, high in zip(
+        b[[50, 198, 201, 350]], mapped.low_ns / 1e9, mapped.high_ns / 1e9, strict=True
+    ):
+        assert low - 1e-5 <= true <= high + 1e-5
+    assert mapped.high_ns[1] - mapped.low_ns[1] > 4.9e9
+    assert mapped.high_ns[0] - mapped.low_ns[0] < 1e6
+
+
+def test_a_stretch_that_fits_nowhere_is_unknown() -> None:
+    b = _random_events(400)
+    a = b.copy()
+    a[250:] += 3.0
+    a[150:250] = np.sort(np.random.default_rng(9).uniform(a[150], a[249], 100))
+    found = sliplab.align(a, b)
+    mapped = found.map(a[[60, 200, 340]])
+    assert mapped.known.tolist() == [True, False, True]
+    assert mapped.ns[1] == UNKNOWN
+
+
+def test_intervals_widen_beyond_the_events() -> None:
+    b = _random_events()
+    a = b + np.random.default_rng(RNG).normal(0, 1e-5, b.size)
+    mapped = sliplab.align(a, b).map(np.array([a[0] - 60, a[100], a[-1] + 60]))
+    assert mapped.within.tolist() == [False, True, False]
+    half = (mapped.high_ns - mapped.low_ns) / 2
+    assert half[[0, 2]].min() > 20 * half[1]
+
+
+@pytest.mark.parametrize(
+    ("a", "options", "text"),
+    [
+        ([1.0, float("nan")], {}, "must be a finite time"),
+        ([[1.0]], {}, "must be one row of numbers"),
+        ([1.0] * 9, {"unit": "h"}, "must be one of s, ms, us, ns"),
+        ([1.0] * 9, {"max_drift_ppm": 0}, r"must be in \(0, 50000\]"),
+        ([1.0] * 9, {"within_s": -1.0, "offset_s": 1.0}, "must be positive"),
+        ([1e12] * 9, {}, "check their unit"),
+    ],
+)
+def test_wrong_arguments_are_named(a: Any, options: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        sliplab.align(a, _random_events(), **options)
+
+
+def test_too_few_events_are_refused() -> None:
+    with pytest.raises(AlignmentRefused, match="a has 4 events"):
+        sliplab.align([1.0, 2.0, 3.0, 4.0], _random_events())
+
+
+def test_command_writes_mapped_times(tmp_path: Path) -> None:
+    b = _random_events()
+    a = b * (1 + 5e-6) + 12.5
+    _write(tmp_path / "a.csv", "time_ms", a * 1e3)
+    _write(tmp_path / "b.csv", "t", b)
+    _write(tmp_path / "grasps.csv", "t", [a[40]])
+    done = here(
+        "align", tmp_path / "a.csv", tmp_path / "b.csv", "--map", tmp_path / "grasps.csv",
+        "--out", tmp_path / "out.csv", "--json",
+    )  # fmt: skip
+    assert json.loads(done.stdout)["times"] == 1
+    with (tmp_path / "out.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert int(row["b_low_ns"]) - 1000 <= b[40] * 1e9 <= int(row["b_high_ns"]) + 1000
+
+
+def test_command_refuses_with_its_reason(tmp_path: Path) -> None:
+    _write(tmp_path / "a.csv", "t", np.arange(100.0))
+    done = here("align", tmp_path / "a.csv", tmp_path / "a.csv", "--json")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["refused"] == "ambiguous"
+    (tmp_path / "b.csv").write_text("t\n1.0\nlate\n")
+    done = here("align", tmp_path / "a.csv", tmp_path / "b.csv")
+    assert "row 2 = late: must be a number" in done.stderr
+
+
+def _write(path: Path, name: str, values: Any) -> None:
+    path.write_text("\n".join([name, *(f"{value:.9f}" for value in values)]) + "\n")
