@@ -96,7 +96,7 @@ def verify(place: str, quarantine: bool = False) -> Verification:
 
 
 def _salvage(store: Store) -> None:
-    """Let plug-ins keep what verifies of trials whose program was killed, if no other one writes."""
+    """Let plug-ins keep what verifies of trials whose program was killed, if none other writes."""
     folders = (path for each in store.campaigns() for path in each.folders("incoming"))
     if not any((path / JOURNAL).exists() for path in folders):
         return
