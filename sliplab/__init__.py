@@ -46,7 +46,6 @@ if TYPE_CHECKING:
         verify,
     )
     from sliplab.flows.collecting.requests import CampaignStopped
-    from sliplab.plugins.align.align import Alignment, AlignmentRefused, align
     from sliplab.protocols.errors import InputError
     from sliplab.protocols.plan import Plan
     from sliplab.storage.errors import StoreError
