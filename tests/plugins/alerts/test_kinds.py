@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -253,9 +254,9 @@ def test_dead_man_ping_is_fetched_within_ten_seconds_of_a_trial_and_delays_nothi
     assert time.monotonic() - began < WITHIN_S  # nobody answers
     with http_server() as (web, fetched):
         case.watch([Receiver()], ping=f"http://127.0.0.1:{web}/alive", about=["paused"])
-        began = time.monotonic()
+        began, pause = time.monotonic(), threading.Event()
         case.look(5 * POLL_S)  # a start and two trials
         while len(fetched) < 3:
             assert time.monotonic() - began < WITHIN_S
-            time.sleep(0.01)
+            pause.wait(0.01)
     assert fetched == ["/alive"] * 3
