@@ -136,7 +136,9 @@ def _interval(
 
 def _uncertainty_ns(recording: Recording, stream: str) -> float:
     known = recording.clocks.devices().get(stream)
-    return np.nan if known is None else float(known.uncertainty_ns)
+    if known is None or known.uncertainty_ns is None:
+        return np.nan
+    return float(known.uncertainty_ns)
 
 
 def _size_px(recording: Recording, stream: str) -> tuple[int, int] | None:

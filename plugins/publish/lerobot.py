@@ -348,12 +348,12 @@ def _event_images(
         part = slice(low, high)
         pixels = (events.y[part].astype(np.int64), events.x[part], 1 - events.p[part].astype(int))
         seen, counted = np.unique(np.ravel_multi_index(pixels, shape), return_counts=True)
-        counted = np.minimum(counted, 255).astype(np.uint8)
-        found = np.bincount((seen % channels) * 256 + counted, minlength=channels * 256)
+        level = np.minimum(counted, 255).astype(np.uint8)
+        found = np.bincount((seen % channels) * 256 + level, minlength=channels * 256)
         found = found.reshape(channels, 256)
         found[:, 0] = height * width - found[:, 1:].sum(1)
         levels.add(found)
-        packed.append({"bytes": sparse_png(seen, counted, height, width), "path": None})
+        packed.append({"bytes": sparse_png(seen, level, height, width), "path": None})
     return pa.array(packed, _IMAGE)
 
 

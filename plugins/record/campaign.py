@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from sliplab.protocols.adapter import Adapter, load_adapter
 from sliplab.protocols.errors import InputError
@@ -52,13 +53,13 @@ def join(campaign: Campaign, analysis: Path | None, simulated: bool) -> str:
 
 def _text(name: str, analysis: Path | None, simulated: bool) -> str:
     """Return the adapter of recorded trials: only its analysis and split mean something."""
-    text, given = "", {}
+    text, given = "", dict[str, Any]()
     if analysis is not None:
         text = read_text(analysis, "analysis file")
         given = parse_yaml(text, analysis)
         if wrong := [key for key in given if key not in _MAY]:
             raise InputError(analysis, wrong[0], None, f"must be one of {', '.join(_MAY)}")
-    head = {
+    head: dict[str, Any] = {
         "adapter": 1,
         "name": name,
         "simulated": simulated,

@@ -71,10 +71,8 @@ def record(
     from sliplab.plugins.record.keys import pressed_keys
     from sliplab.plugins.record.recorder import Recorder
 
-    limits = [
-        None if text is None else _seconds(name, text)
-        for name, text in (("--for", length), ("--every", every))
-    ]
+    length_s = None if length is None else _seconds("--for", length)
+    every_s = None if every is None else _seconds("--every", every)
     given = dict(_pair(text) for text in condition or ())
     result: Json = {}
     with (
@@ -91,7 +89,7 @@ def record(
     ):
         for trial in recorder.salvaged:
             console.say(f"kept what verifies of the unfinished trial {trial}")
-        session = _Session(recorder, given, key, *limits)
+        session = _Session(recorder, given, key, length_s, every_s)
         try:
             session.run()
         except KeyboardInterrupt:

@@ -16,7 +16,7 @@ from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.table import CLOCK, chunk_type, rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.timing import WIRED, StreamTiming
+from sliplab.protocols.timing import WIRED, StreamGrade, StreamTiming
 from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
 from sliplab.rigs.build import driven_stream, taught_frame
 from sliplab.rigs.core.device_stream import DeviceStream
@@ -217,7 +217,7 @@ def push(
     if kind == FRAMES_KIND:
         told["mid_exposure_ns"] = 0
     if clock == "own":
-        grade = "host arrival" if kind == FRAMES_KIND else "host time"
+        grade: StreamGrade = "host arrival" if kind == FRAMES_KIND else "host time"
         told["timing"] = StreamTiming(grade=grade)
         how = READS if kind == EVENTS_KIND else TIMING
     else:
@@ -375,14 +375,14 @@ def _first_frames(path: Path, rig: RigFile, devices: DeviceSettings) -> Source:
     camera = driver.build(devices.frame_camera, spec.scale_px_per_mm)
     size = spec.width_px, spec.height_px
     camera.set_region(*size)
-    clock = rig.timing.frame_camera.model_dump()
+    clock = rig.timing.frame_camera.model_dump() | {"grade": grade}
     about = StreamRecord(
         kind=FRAMES_KIND,
         rows=0,
         size_px=size,
         px_per_mm=spec.scale_px_per_mm,
         mid_exposure_ns=camera.mid_exposure_ns,
-        timing=StreamTiming(**clock, grade=grade, delay=rig.timing.frame_delay),
+        timing=StreamTiming(**clock, delay=rig.timing.frame_delay),
     )
     stream = DeviceStream(FRAMES_KIND, camera, about)
     return Source(stream, locks=driver.locks(devices.frame_camera))

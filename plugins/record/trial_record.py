@@ -84,7 +84,7 @@ def make_record(
     notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
     notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
     notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
-    about = {
+    about: dict[str, Any] = {
         "format": FORMAT,
         "from": "sliplab record",
         "epoch": "the host's monotonic clock",
@@ -136,12 +136,10 @@ def make_record(
 def _maps(clocks: Clocks) -> TrialClockMaps:
     streams = {name: each for name, each in clocks.found.items() if name not in FIRST_CAMERAS}
     first = {name: each for name, each in clocks.found.items() if name in FIRST_CAMERAS}
-    return TrialClockMaps(
-        reference="host",
-        **first,
-        **({"refused": clocks.refused} if clocks.refused else {}),
-        **({"streams": streams} if streams else {}),
-    )
+    found: dict[str, Any] = {"reference": "host", **first}
+    found |= {"refused": clocks.refused} if clocks.refused else {}
+    found |= {"streams": streams} if streams else {}
+    return TrialClockMaps(**found)
 
 
 def _streams(folder: Path, begun: BegunTrial) -> dict[str, tuple[int, StreamRecord]]:
@@ -182,5 +180,5 @@ def _given(marks: Sequence[Mark]) -> Given | None:
         return None
     errors = [mark.uncertainty_ns for mark in first.values()]
     bound = None if None in errors else max(error for error in errors if error is not None)
-    onsets = {key: mark.t_ns for key, mark in first.items()}
+    onsets: dict[str, Any] = {key: mark.t_ns for key, mark in first.items()}
     return Given(source="marks", uncertainty_ns=bound, **onsets)
