@@ -47,6 +47,7 @@ class ServedRuns:
         self._store = store
         self._on_rig, self._control = on_rig, control
         self._run: Any = None
+        self._asked: Any = None
         self._process: asyncio.subprocess.Process | None = None
         self._stop_by: float | None = None
         self._words: dict[UUID, asyncio.Future[None]] = {}
@@ -78,6 +79,11 @@ class ServedRuns:
         """Check the run on the rig, and start due runs."""
         if self._process is not None:
             await self._supervise(client)
+        if self._asked is not None and self._process is None:
+            run = await client.read_flow_run(self._asked.id)
+            self._asked = None
+            if run.state.is_pending():
+                await self._start(run)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
         due = await client.get_scheduled_flow_runs_for_deployments(
             [*self._on_rig, *self._control], scheduled_before=datetime.now(UTC)
@@ -95,9 +101,14 @@ class ServedRuns:
         from prefect.client.schemas.responses import SetStateStatus
         from prefect.states import Pending
 
+        self._asked = run  # whose answer may be lost: it would stay pending for ever
         answer = await client.set_flow_run_state(run.id, Pending())
-        if answer.status is not SetStateStatus.ACCEPT:
-            return
+        self._asked = None
+        if answer.status is SetStateStatus.ACCEPT:
+            await self._start(run)
+
+    async def _start(self, run: Any) -> None:
+        """Start the process of a pending run."""
         command = (sys.executable, "-P", "-m", "sliplab.flows.server.runs", str(run.id))
         self._run, self._stop_by = run, None
         self._process = await asyncio.create_subprocess_exec(

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID, uuid4
 
 import pytest
 
+from sliplab.flows.server.runs import ServedRuns
 from sliplab.storage.files import read_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials.store import Store
@@ -47,6 +52,40 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     Store.create(folder / "store")
     with serving(folder / "store", RIG, "ends", None, folder / "log", nights) as found:
         yield found
+
+
+def test_a_run_whose_begin_got_no_answer_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server took it, and answered too late: it would stay pending, and its night be lost."""
+    from prefect.states import Pending, Scheduled
+
+    run = SimpleNamespace(id=uuid4(), deployment_id=uuid4(), state=Scheduled())
+
+    class Client:
+        async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
+            return [run] if run.state.is_scheduled() else []
+
+        async def read_flow_run(self, wanted: UUID) -> Any:
+            return run
+
+        async def set_flow_run_state(self, wanted: UUID, state: Any) -> None:
+            run.state = Pending()
+            raise TimeoutError
+
+    begun: list[Any] = []
+
+    async def start(served: ServedRuns, wanted: Any) -> None:
+        begun.append(wanted)
+
+    monkeypatch.setattr(ServedRuns, "_start", start)
+    served, client, threads = ServedRuns(tmp_path, {run.deployment_id: None}, {}), Client(), None
+    with pytest.raises(TimeoutError):
+        asyncio.run(served._look(client, threads))
+    assert begun == []
+    for _ in range(2):
+        asyncio.run(served._look(client, threads))
+    assert begun == [run]
 
 
 def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:
