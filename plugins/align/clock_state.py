@@ -27,7 +27,7 @@ _STRAIGHT = 0.9
 """Prior probability of a clock that wanders too little to be seen."""
 _FEW = 12
 """A clock with fewer events is taken not to wander."""
-_DIFFUSE = 1e10
+_DIFFUSE = 1e8
 _CHUNK = 200_000
 
 
@@ -258,11 +258,12 @@ def _smoothed(
             s = p00 + 1.0
             v = z[k] - level
             g0, g1 = p00 / s, p01 / s
-            # L = I - g (1 0)
-            a0 = v / s + (1.0 - g0) * r0 - g1 * r1
-            m0 = (1.0 - g0) * n00 - g1 * n01
-            m1 = (1.0 - g0) * n01 - g1 * n11
-            n00 = 1.0 / s + (1.0 - g0) * m0 - g1 * m1
+            # L = I - g (1 0); 1 - g0 would lose digits where nothing was known before
+            u = 1.0 / s
+            a0 = u * v + u * r0 - g1 * r1
+            m0 = u * n00 - g1 * n01
+            m1 = u * n01 - g1 * n11
+            n00 = u + u * m0 - g1 * m1
             n01 = m1
             r0 = a0
         if n00 > 0.0:

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import sliplab
 from benchmarks.align import KINDS, make_trial
 from sliplab import AlignmentRefused, InputError
 from sliplab.plugins.align.align import UNKNOWN
+from sliplab.plugins.align.clock_state import ClockState
 from sliplab.plugins.align.events import events_from
 from sliplab.storage.streams import F64
 from tests.command_line import here
@@ -190,3 +192,22 @@ def test_command_refuses_with_its_reason(tmp_path: Path) -> None:
 
 def _write(path: Path, name: str, values: Any) -> None:
     path.write_text("\n".join([name, *(f"{value:.9f}" for value in values)]) + "\n")
+
+
+@pytest.mark.parametrize("n", [5, 8, 30])
+def test_a_straight_clock_has_the_interval_of_least_squares(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x = np.sort(rng.uniform(0, 1e11, n))
+    state = ClockState.through(x, x + rng.normal(0, 1e4, n))
+    asked = np.linspace(-5e10, 1.5e11, 9)
+    gain, half = state.at(asked)
+    slope, level = np.polyfit(x, state.gained + state.slope * (x - x[0]) + state.level, 1)
+    rest = state.gained + state.slope * (x - x[0]) + state.level - slope * x - level
+    variance = (rest**2).sum() / (n - 2)
+    spread = variance * (1 / n + (asked - x.mean()) ** 2 / ((x - x.mean()) ** 2).sum())
+    # one that wanders unseen widens it
+    expected = stats.t.ppf(0.975, n - 2) * np.sqrt(spread)
+    assert (half > 0.99 * expected).all()
+    assert (half < (1.01 if n < 12 else 2.0) * expected).all()
+    if n < 12:
+        np.testing.assert_allclose(gain, slope * asked + level, atol=1e-2 * half.min())
