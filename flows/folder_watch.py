@@ -83,13 +83,13 @@ class FolderWatch:
         for name, files in found:
             names.setdefault(name, []).append((name, files))
         for group in names.values():  # several files of one name are an error
-            files = [file for _, each in group for file in each.files]
-            every = all(file in closed for file in files)
-            fresh = any(self._done.get(file) != closed.get(file) for file in files)
+            paths = [path for _, each in group for path in each.files]
+            every = all(path in closed for path in paths)
+            fresh = any(self._done.get(path) != closed.get(path) for path in paths)
             if every and fresh:
                 if not self._import(group):
                     return
-                self._done |= {file: closed[file] for file in files}
+                self._done |= {path: closed[path] for path in paths}
         for skipped in skipped_in(self.path, self.kind) if found else []:
             file = self.path / skipped.file
             if file in closed and self._done.get(file) != closed[file]:
@@ -179,7 +179,15 @@ def _writes(process: Path, number: str) -> bool:
     return bool(int(flags.split()[1], 8) & _WRITES)
 
 
-def watch(path: Path, store: Path, name: str | None, kind: str | None, **options: bool) -> Json:
+def watch(
+    path: Path,
+    store: Path,
+    name: str | None,
+    kind: str | None,
+    *,
+    simulated: bool = False,
+    salvage: bool = False,
+) -> Json:
     """Watch a folder until the user stops it; see `FolderWatch`.
 
     Raises:
@@ -190,7 +198,7 @@ def watch(path: Path, store: Path, name: str | None, kind: str | None, **options
     if name is None:
         raise InputError("--name", "", None, "is missing: the name of the campaign")
     recordings_in(path, kind or MIXED)
-    watched = FolderWatch(path, store, name, kind or MIXED, **options)
+    watched = FolderWatch(path, store, name, kind or MIXED, simulated, salvage)
     result = watched.run()
     console.say(f"imported {plural(len(watched.imported), 'trial')}")
     return result

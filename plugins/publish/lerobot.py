@@ -29,7 +29,7 @@ from sliplab.plugins.publish.sparse_png import sparse_png
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json_aside
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, I64, WRENCH, Json
+from sliplab.storage.streams import EVENTS_KIND, I64, U8, WRENCH, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
@@ -348,12 +348,12 @@ def _event_images(
         part = slice(low, high)
         pixels = (events.y[part].astype(np.int64), events.x[part], 1 - events.p[part].astype(int))
         seen, counted = np.unique(np.ravel_multi_index(pixels, shape), return_counts=True)
-        counted = np.minimum(counted, 255).astype(np.uint8)
-        found = np.bincount((seen % channels) * 256 + counted, minlength=channels * 256)
+        levelled: U8 = np.minimum(counted, 255).astype(np.uint8)
+        found = np.bincount((seen % channels) * 256 + levelled, minlength=channels * 256)
         found = found.reshape(channels, 256)
         found[:, 0] = height * width - found[:, 1:].sum(1)
         levels.add(found)
-        packed.append({"bytes": sparse_png(seen, counted, height, width), "path": None})
+        packed.append({"bytes": sparse_png(seen, levelled, height, width), "path": None})
     return pa.array(packed, _IMAGE)
 
 
