@@ -29,7 +29,7 @@ from sliplab.plugins.publish.sparse_png import sparse_png
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json_aside
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, I64, U8, WRENCH, Json
+from sliplab.storage.streams import EVENTS_KIND, I64, WRENCH, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
