@@ -44,6 +44,7 @@ ELSEWHERE = (
     "--dask",
     "s3://",
     "--follow",
+    "--watch",
     "--pilot",
     "KIND",
     "lab-pickles",
