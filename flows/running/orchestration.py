@@ -426,7 +426,7 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
                     f"does not answer ({reason_of(error)})"
                 ) from error
             link.mark_lost(str(error) if isinstance(error, ServerError) else error)
-            return _without_server(work, argument)
+            return _without_server(work.do, argument)
         return _reported(flow, flow_run, argument, work, link, cluster)
 
 
@@ -472,7 +472,7 @@ def _reported(
         if not work.started:
             link.mark_lost(error)
             try:
-                _without_server(work, argument)
+                _without_server(do, argument)
             except BaseException:
                 if not work.started:  # an error of the work is stored, and raised below
                     raise
@@ -494,7 +494,7 @@ def _reported(
     return work.outcome()
 
 
-def _without_server(work: _Work, argument: Any) -> Any:
+def _without_server(do: Callable[[Any], Any], argument: Any) -> Any:
     """Do the work without a server that records it."""
     from prefect.context import SyncClientContext
     from prefect.events.clients import NullEventsClient
@@ -509,7 +509,7 @@ def _without_server(work: _Work, argument: Any) -> Any:
     EventsWorker.set_client_override(NullEventsClient)
     try:
         with temporary_settings(updates=settings), SyncClientContext():
-            return work.do(argument)
+            return do(argument)
     finally:
         EventsWorker.set_client_override(None)
 

@@ -25,13 +25,22 @@ def align_(
     ],
     offset: Annotated[
         float | None,
-        typer.Option("--offset", help="B less A at A's first event, s; for regular pulses, taps."),
+        typer.Option(
+            "--offset",
+            min=-1e12,
+            max=1e12,
+            help="B less A at A's first event, s; for regular pulses, taps.",
+        ),
     ] = None,
     within: Annotated[
-        float, typer.Option("--within", help="By how much --offset may be wrong, s.")
+        float,
+        typer.Option("--within", min=0, max=1e9, help="By how much --offset may be wrong, s."),
     ] = 0.1,
     drift: Annotated[
-        float, typer.Option("--max-drift-ppm", help="Largest difference of the clocks' rates.")
+        float,
+        typer.Option(
+            "--max-drift-ppm", min=0, max=1e5, help="Largest difference of the clocks' rates."
+        ),
     ] = 500.0,
     unit: Annotated[
         str | None,

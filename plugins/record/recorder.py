@@ -97,17 +97,18 @@ class Recorder:
         self._running: RecordedTrial | None = None
 
     def __enter__(self) -> Self:
-        with ExitStack() as undo:
+        with ExitStack() as undo, ExitStack() as devices:
+            self.sources = opened(self._streams, devices)  # wrong input writes nothing
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
-            self.sources = opened(self._streams, undo)
             locks = {
                 lock_file(name): what
                 for source in self.sources
                 for name, what in source.locks.items()
             }
             undo.enter_context(locked(locks, self._store))
+            undo.push(devices.pop_all())  # closed before their locks are free
             self._experiment = join(self.campaign, self._analysis, self._simulated)
             self.salvaged = salvage_campaign(self.campaign)
             for source in self.sources:

@@ -109,5 +109,5 @@ def test_the_references_examples_run(
 
 def test_there_is_a_guide_for_each_question() -> None:
     listed = (ROOT / "docs" / "howto" / "index.md").read_text()
-    assert len(GUIDES) == 10
+    assert len(GUIDES) == 12
     assert all(f"({guide.name})" in listed for guide in [*GUIDES, NOTEBOOK])

@@ -36,6 +36,8 @@ WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
     **{
         name: (words, GONE, None, None)
         for name, words in {
+            "align": f"{GONE} ROOM/file",
+            "record": f"{GONE} --store ROOM/s --campaign c",
             "check": f"{GONE} --rig mock --store ROOM/s",
             "register": f"{GONE} --store ROOM/s",
             "collect": f"{GONE} --rig mock --store ROOM/s",

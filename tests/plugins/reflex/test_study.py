@@ -136,7 +136,10 @@ def test_a_store_detects_by_any_of_its_detectors(
     model = place / "models" / "seed0.pt"
     for options, right in (
         (("--model", place, "--detector", "cusum"), "must be one of network, paper, smoothing"),
-        (("--model", model, "--detector", "hmm counts"), "name the store with --model"),
+        (
+            ("--model", model, "--detector", "hmm counts"),
+            "of a store needs the store as --model",
+        ),
         (("--model", place, "--detector", "hmm counts", "--margin", "2"), "is of the rule"),
     ):
         done = here(*asked, *options)
