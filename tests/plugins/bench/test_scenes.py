@@ -54,7 +54,7 @@ def test_a_larger_set_begins_with_the_worlds_of_a_smaller_one() -> None:
 
 @pytest.fixture(scope="module")
 def slides() -> list[Scene]:
-    return [scenes.simulated(drawn) for drawn in scenes.test_scenes(SIZE, 2)]
+    return [scenes.simulated(drawn) for drawn in scenes.test_scenes(SIZE, 1)]
 
 
 def test_a_scene_repeats_to_the_event(slides: list[Scene]) -> None:
@@ -69,8 +69,9 @@ def test_a_tip_slips_in_the_motion_and_its_marker_moves_later(slides: list[Scene
         slip = scene.slip
         assert drawn.hold_s * 1e6 < slip.physical_us < slip.paper_us < slip.gross_us
         assert slip.gross_us <= scene.end_us
-        # the marker of a tip that slides as fast as the arm needs 0.1 mm, as of the rig's 20 px/mm
-        assert slip.paper_us - slip.physical_us >= 0.9e6 * 0.1 / drawn.speed_mm_s
+        # the marker of a tip that slides as fast as the arm needs 0.1 mm, as of the rig's 20 px/mm;
+        # where friction falls, a bent tip springs ahead of it
+        assert slip.paper_us - slip.physical_us >= 0.6e6 * 0.1 / drawn.speed_mm_s
 
 
 def test_events_rise_when_the_arm_moves_and_not_before(slides: list[Scene]) -> None:
