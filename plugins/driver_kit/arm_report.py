@@ -139,7 +139,7 @@ def follow(bench: ArmBench, *path: Segment) -> Report:
     """
     arm, before = bench.arm, bench.place()
     bench.call("read_poses", arm.read_poses)
-    report = Report(bench.clock_s(), before, clock_offset_ns(bench), bench.fake.unsent)
+    report = Report(bench.clock_s(), before, clock_offset_ns(bench), bench.unsent)
     begin, seconds = before, 0.0
     for segment in path:
         seconds, begin = seconds + segment_seconds(begin, segment), segment.to

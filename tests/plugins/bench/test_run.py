@@ -166,10 +166,10 @@ def test_the_command_prints_what_it_writes(folder: Path) -> None:
     shown = here(*words)
     assert "bench 2, small, seed 5 (simulated)" in shown.stdout
     said = " ".join(shown.stderr.split())
-    assert "over 2 test worlds and 1 with nuisances; below 24 trials or worlds, here 1" in said
+    assert "over 2 test worlds and 8 with nuisances; below 24 trials or worlds, here 2" in said
     for row in data["detectors"]:
         assert row["curve"][0]["test"]["worlds"] == 2
-        assert row["disturbed"]["low"] is None, "one world bounds nothing"
+        assert row["disturbed"]["clusters"] == len(NUISANCES)
 
 
 def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Path) -> None:
