@@ -170,11 +170,6 @@ class ArmBench(DeviceBench):
         """Close the arm; one that is lost while it may move says so, which is right."""
         self.arm.close()
 
-    @property
-    def unsent(self) -> int:
-        """Samples that the fake was too late to send so far; no driver can read them."""
-        return self.fake.unsent
-
     def close_fake(self) -> None:
         """Close the fake controller."""
         self.fake.close()

@@ -16,9 +16,8 @@ from sliplab.storage.streams import PoseChunk
 
 STEP_S = 0.002
 """Step at which the true motion is evaluated, s."""
-OFFSET_READS, OFFSET_S = 10, 0.5
-"""Different values of the driver's clock, of which a busy computer may delay some, and the longest
-time for which they are waited for, s."""
+OFFSET_READS, OFFSET_EVERY_S = 10, 0.01
+"""Reads of the driver's clock, of which a busy computer may delay some, and time between them."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,11 @@ class Report:
         start: the call of `start`.
         before: the true pose before the path.
         offset_ns: the driver's clock minus the true one, ns.
-        unsent: number of samples that the fake had been too late to send before the path.
     """
 
     begin_s: float
     before: Pose
     offset_ns: int
-    unsent: int
     start: Answer | None = None
     end_s: float = 0.0
     answers: list[Answer] = field(default_factory=list)
@@ -113,21 +110,12 @@ def ask(bench: ArmBench, name: str, work: Callable[[], Any]) -> Answer:
 
 
 def clock_offset_ns(bench: ArmBench) -> int:
-    """Return the driver's clock minus the true one, ns; a stale answer of `now_ns` is too low.
-
-    A value that was read before tells nothing new: a busy computer may leave it for a while.
-    """
-    values: set[int] = set()
-    offsets: list[int] = []
-
-    def read() -> bool:
-        answer = ask(bench, "now_ns", bench.arm.now_ns)
-        values.add(answer.value)
-        offsets.append(answer.value - round(answer.end_s * 1e9))
-        return len(values) >= OFFSET_READS
-
-    bench.until(read, OFFSET_S)
-    return max(offsets)
+    """Return the driver's clock minus the true one, ns; a stale answer of `now_ns` is too low."""
+    reads: list[Answer] = []
+    for _ in range(OFFSET_READS):
+        reads.append(ask(bench, "now_ns", bench.arm.now_ns))
+        bench.wait(OFFSET_EVERY_S)
+    return max(read.value - round(read.end_s * 1e9) for read in reads)
 
 
 def follow(bench: ArmBench, *path: Segment) -> Report:
@@ -139,7 +127,7 @@ def follow(bench: ArmBench, *path: Segment) -> Report:
     """
     arm, before = bench.arm, bench.place()
     bench.call("read_poses", arm.read_poses)
-    report = Report(bench.clock_s(), before, clock_offset_ns(bench), bench.unsent)
+    report = Report(bench.clock_s(), before, clock_offset_ns(bench))
     begin, seconds = before, 0.0
     for segment in path:
         seconds, begin = seconds + segment_seconds(begin, segment), segment.to

@@ -293,12 +293,7 @@ class FakeController(ABC):
         motion: where the tool centre point is; a straight-line motion from `HOME` if left out.
         clock: the controller's clock; a new one that runs at `rate` if left out.
         rate: controller seconds per host second.
-
-    Attributes:
-        unsent: number of samples that it was too late to send, on a busy computer.
     """
-
-    unsent = 0
 
     def __init__(
         self,

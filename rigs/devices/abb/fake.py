@@ -340,9 +340,7 @@ class FakeAbb(FakeController):
         self._number += 1
         if self._to_lose > 0:
             self._to_lose -= 1
-        elif late:
-            self.unsent += 1
-        elif not self._silent:
+        elif not self._silent and not late:
             with contextlib.suppress(OSError):
                 self._udp.sendto(self._packet(t_s), self._egm)
 

@@ -92,10 +92,6 @@ class MockArmBench(OnVirtualClock, ArmBench):
         low, high = ([value + step for value in self.home.xyz_mm] for step in (-20.0, 20.0))
         self.limits = ArmLimits.model_validate({"low_mm": low, "high_mm": high})
 
-    @property
-    def unsent(self) -> int:
-        return 0
-
     def place(self) -> Pose:
         return self.devices.arm.pose()
 
