@@ -33,6 +33,7 @@ class SimulatedSession:
 
     collector: TrialCollector
     trials: list[Trial]
+    feed: LiveFeed
 
     def take(self, count: int | None = None) -> float:
         """Take the next trials (all by default); return the planned seconds of their motion.
@@ -65,7 +66,7 @@ def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[
         collector = TrialCollector(run_request.plan, run_request.rig, device, campaign, feed=feed)
         try:
             with feed.running():
-                yield SimulatedSession(collector, [every[index] for index in sorted(chosen)])
+                yield SimulatedSession(collector, [every[index] for index in sorted(chosen)], feed)
         finally:
             device.close()
 

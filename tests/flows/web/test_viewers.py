@@ -46,7 +46,7 @@ class Viewer(threading.Thread):
         head = f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nCookie: {cookie}\r\n\r\n"
         self._line.sendall(head.encode())
         self.leaves = threading.Event()
-        self.pictures = 0
+        self.pictures, self.cut = 0, cut
 
     def run(self) -> None:
         """Count the pictures."""
@@ -55,12 +55,13 @@ class Viewer(threading.Thread):
                 self.pictures += part.count(b"event: pictures")
 
     def leave(self) -> None:
-        """Close the connection after what comes next."""
+        """Close the connection; one that is cut, after what comes next."""
         self.leaves.set()
-        if self.ident is None:  # it reads nothing
-            self._line.close()
-        else:
+        if not self.cut:
+            self._line.shutdown(socket.SHUT_RDWR)
+        if self.ident is not None:
             self.join(LIMIT_S)
+        self._line.close()
 
 
 @contextmanager
@@ -103,8 +104,12 @@ def test_viewers_change_no_byte() -> None:
         port = stack.enter_context(page(store))
         dropped, silent = Viewer(port, cut=True), Viewer(port)
         others = [Viewer(port) for _ in range(VIEWERS - 2)]
+        for viewer in (dropped, silent, *others):
+            stack.callback(viewer.leave)
         for viewer in (dropped, *others):
             viewer.start()
+        # a simulated trial may be over before the collection sees that somebody watches
+        until("the viewers are seen", lambda: work.feed.watched)
         work.take(1)
         until("pictures", lambda: all(viewer.pictures for viewer in (dropped, *others)))
         dropped.leave()
@@ -112,5 +117,3 @@ def test_viewers_change_no_byte() -> None:
         until("all trials", lambda: len(data(work)) == TRIALS)
         assert data(work) == expected
         assert len(expected) == TRIALS
-        for viewer in (silent, *others):
-            viewer.leave()
