@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, build_opener
 
@@ -66,35 +67,37 @@ async def watch(page: PageServer | None, store: Path, server: str, stopped: asyn
         page: our own server; None for the user's.
         server: as `run_records.server_name` calls it.
     """
-    misses, lost = 0, False
-    while not stopped.is_set():
-        with suppress(TimeoutError):
-            await asyncio.wait_for(stopped.wait(), WATCH_S)
-            return
-        if await _answers():
-            if lost:
-                console.say("Prefect's server responds again")
-                with suppress(Exception):  # the next start does it again
-                    await asyncio.to_thread(run_records.close_killed_runs, store, server)
-            misses, lost = 0, False
-            continue
-        misses += 1
-        ended = page is not None and not page.server.alive
-        if not lost and (ended or misses == MISSES):
-            lost = True
-            console.say(
-                f"warning: Prefect's server {'ended' if ended else 'does not answer'}; what runs "
-                "continues, and its end is reported when the server answers again"
-            )
-        if page is not None and (ended or misses % MISSES == 0):
-            await page.renew()
-
-
-async def _answers() -> bool:
     from prefect.client.orchestration import get_client
 
+    misses, lost = 0, False
+    # one client: each has a copy of the certificates, which only the garbage collector frees
+    async with get_client() as client:
+        while not stopped.is_set():
+            with suppress(TimeoutError):
+                await asyncio.wait_for(stopped.wait(), WATCH_S)
+                return
+            if await _answers(client):
+                if lost:
+                    console.say("Prefect's server responds again")
+                    with suppress(Exception):  # the next start does it again
+                        await asyncio.to_thread(run_records.close_killed_runs, store, server)
+                misses, lost = 0, False
+                continue
+            misses += 1
+            ended = page is not None and not page.server.alive
+            if not lost and (ended or misses == MISSES):
+                lost = True
+                console.say(
+                    f"warning: Prefect's server {'ended' if ended else 'does not answer'}; what "
+                    "runs continues, and its end is reported when the server answers again"
+                )
+            if page is not None and (ended or misses % MISSES == 0):
+                await page.renew()
+
+
+async def _answers(client: Any) -> bool:
     try:
-        async with asyncio.timeout(WATCH_S), get_client() as client:
+        async with asyncio.timeout(WATCH_S):
             return await client.api_healthcheck() is None
     except Exception:
         return False

@@ -144,7 +144,7 @@ async def _serve(
         working = [
             asyncio.create_task(each.carry_out(min(poll_s, POLL_S), stopped)) for each in lanes
         ]
-    watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
+        watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     helping = [
         asyncio.create_task(keep_running(words, stopped, again_s=AGAIN_S[words[0]]))
         for words in programs
