@@ -113,21 +113,7 @@ async def _serve(
     from sliplab.flows.server.deployments import BESIDE, CONTROL, ON_RIG
 
     stopped = asyncio.Event()
-    registered: dict[UUID, Any] = {}
-    flows = (*ON_RIG, *BESIDE, *CONTROL)
-    for flow in flows:
-        await _refuse_another(flow.name, here.name, here.folder)
-        when = _prefects([item for item in schedules if item.flow == flow.name])
-        made = await flow.ato_deployment(
-            deployment_name(flow.name, here.name),
-            schedules=when,
-            tags=_tags(here.folder, here.rig),
-            description=flow.description,
-        )
-        registered[await made.aapply()] = flow
-    names = [flow.name for flow in flows]
-    await _close_stranded(here.name, names, here.folder)
-    await _delete_older(here.name, names, here.folder)
+    registered = await _register(here, schedules, (*ON_RIG, *BESIDE, *CONTROL))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
@@ -164,6 +150,35 @@ async def _serve(
     ):
         if isinstance(outcome, Exception):
             raise outcome
+
+
+async def _register(
+    here: Service, schedules: Sequence[Scheduled], flows: Sequence[Any]
+) -> dict[UUID, Any]:
+    """Register a deployment of each flow; return the flows by their deployments' ids.
+
+    Raises:
+        InputError: another program serves another store under this name.
+    """
+    from prefect.context import AsyncClientContext
+
+    registered: dict[UUID, Any] = {}
+    names = [flow.name for flow in flows]
+    # one client for all of it: see `page_server.watch`
+    async with AsyncClientContext.get_or_create():
+        for flow in flows:
+            await _refuse_another(flow.name, here.name, here.folder)
+            when = _prefects([item for item in schedules if item.flow == flow.name])
+            made = await flow.ato_deployment(
+                deployment_name(flow.name, here.name),
+                schedules=when,
+                tags=_tags(here.folder, here.rig),
+                description=flow.description,
+            )
+            registered[await made.aapply()] = flow
+        await _close_stranded(here.name, names, here.folder)
+        await _delete_older(here.name, names, here.folder)
+    return registered
 
 
 def _beside(url: str, port: int) -> int:

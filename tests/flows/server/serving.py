@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gc
 import http.client
 import json
 import os
@@ -21,6 +22,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpcore
+
 from tests.conftest import ROOT
 
 LIMIT_S = 120.0
@@ -37,6 +40,24 @@ def until(what: str, found: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
         assert time.monotonic() < end, f"waited {limit_s:g} s for {what}"
         pause.wait(0.05)
     return answer
+
+
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Leave garbage where `clients` sees it, while the block runs."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+def clients() -> int:
+    """HTTP clients in this process, those that are garbage included.
+
+    Each has a copy of the certificates, 0.7 MB; the tests share one.
+    """
+    return sum(isinstance(item, httpcore.AsyncConnectionPool) for item in gc.get_objects())
 
 
 def access(url: str, password: str) -> dict[str, str]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
-import httpcore
 import pytest
 
 from sliplab.flows.server import page_server
+from tests.flows.server.serving import clients, no_garbage_collection
 
 ANSWER = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 4\r\n\r\ntrue"
 
@@ -87,14 +86,6 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_server, "WATCH_S", 0.05)
 
 
-def clients() -> int:
-    """HTTP clients in this process, those that are garbage included.
-
-    Each has a copy of the certificates, 0.7 MB; the tests share one.
-    """
-    return sum(isinstance(item, httpcore.AsyncConnectionPool) for item in gc.get_objects())
-
-
 def test_checks_leave_no_clients_for_the_garbage_collector(tmp_path: Path) -> None:
     async def run() -> None:
         server = HealthyServer()
@@ -104,11 +95,8 @@ def test_checks_leave_no_clients_for_the_garbage_collector(tmp_path: Path) -> No
             await server.answered(20)
             assert clients() == before
 
-    gc.disable()
-    try:
+    with no_garbage_collection():
         asyncio.run(run())
-    finally:
-        gc.enable()
 
 
 def test_a_server_that_comes_back_is_found_again(

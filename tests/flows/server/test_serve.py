@@ -41,7 +41,7 @@ from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
-from tests.flows.server.serving import Page, until
+from tests.flows.server.serving import Page, clients, no_garbage_collection, until
 from tests.storage.trial_files import campaign as plain_campaign
 from tests.storage.trial_files import commit
 
@@ -370,6 +370,22 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     until("being served", lambda: page.deployment("collect")["status"] == "READY")
     with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
         asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
+
+
+def test_all_deployments_are_registered_by_one_client(
+    service: Service, server: EmbeddedServer
+) -> None:
+    from sliplab.flows.server.deployments import label, stop
+
+    with no_garbage_collection():
+        before = clients()
+        here = replace(service, name="registered")
+        registered = asyncio.run(serve._register(here, [], (label, stop)))
+        assert clients() == before + 1
+    page = Page(server.url, server.password, "registered")
+    assert {str(number) for number in registered} == {
+        page.deployment(name)["id"] for name in ("label", "stop")
+    }
 
 
 def test_what_a_killed_service_had_taken_is_closed(
