@@ -101,6 +101,22 @@ def brushed(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return RATE_HZ * np.exp(-(front**2) / 0.5)
 
 
+def jolted(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Markers move slowly; for 60 ms a knock shakes each of them in its own way, ten times faster."""
+    phase = 2.4 * np.arange(len(CENTRES))
+    own = 0.5 + 0.5 * np.sin(2 * np.pi * 60 * t[:, None] + phase)
+    knock = (t > SLIP_S) & (t < SLIP_S + 0.06)
+    return moving(t) / 4 * np.where(knock[:, None], 1 + 15 * own, 1.0)
+
+
+def held_back(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """An object pushes three neighbours while all move, and holds one of them for 60 ms."""
+    rates = moving(t)
+    rates[(t > SLIP_S) & (t < SLIP_S + 0.06), -3:] *= 4
+    rates[(t > SLIP_S + 0.06) & (t < SLIP_S + 0.12), -1] = 0.0
+    return rates
+
+
 def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Noise alone."""
     return np.zeros((len(t), len(CENTRES)))
@@ -117,7 +133,9 @@ def test_a_marker_that_comes_to_rest_is_seen_at_once(
     assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
 
 
-@pytest.mark.parametrize("rates", [moving, slower, stopping, shaken, brushed, still])
+@pytest.mark.parametrize(
+    "rates", [moving, slower, stopping, shaken, brushed, jolted, held_back, still]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_moves_all_alike_and_what_pushes_single_ones_is_no_slip(
     rates: Rates, seed: int
