@@ -409,7 +409,8 @@ class _Fit:
         # one that may be there, and would be half as wrong on either side
         doubt = 0.0
         if step is not None:
-            doubt = abs(step.size) / 2 * float(special.expit(1.5 * (step.gain - _DOUBT)))
+            likely = float(special.expit(1.5 * (step.gain - _DOUBT)))
+            doubt = likely * abs(step.size) / 2
         # what a unit hides that no jitter shakes (Widrow and Kollar 2008)
         shaken = state.sigma / self.unit
         doubt += 0.5 * self.unit * float(np.exp(-2 * np.pi**2 * shaken**2))
