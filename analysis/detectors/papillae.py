@@ -19,12 +19,12 @@ Every millisecond:
    are not independent.
 4. **Dispersion**: the test's statistic is divided by the square of how much more the other places'
    shares vary than by chance (Pearson's statistic per degree of freedom, McCullagh & Nelder 1989,
-   section 4.5). The quarter of the places that differ most are left out: they may be the tips that
+   section 4.5). The half of the places that differ most is left out: they may be the tips that
    slide. While an object brushes over single papillae, which shows by places with far more events
    than before, the statistic is divided by `TOUCHED_SCALE` too.
 
-Evidence is the largest statistic of all places from `LEAST` on; 0 below, and while fewer than
-`FEWEST_PLACES` of them move.
+Evidence is the sum of the two largest statistics of all places from `LEAST` on, since tips let go
+one after the other; 0 below, and while fewer than `FEWEST_PLACES` of them move.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ AT_REST, DISTURBED = 0.1, 2.0
 """Rates of a place whose tip slides, and of one that is pushed, by what it had before."""
 SUSPECTED = 6.0
 """Statistic from which a place does not count as one of the others."""
-LEAST = 9.0
+LEAST = 12.0
 """Statistic below which nothing is evidence: a knock against the arm reaches up to this."""
-TOUCHED = 15.0
-"""Statistic of a pushed place from which another object touches it; slides reach 10."""
+TOUCHED = 20.0
+"""Statistic of a pushed place from which another object touches it; slides reach about 15."""
 TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
 """An object that let go pulls the papillae's motion about for so long."""
 LARGEST = 30.0
@@ -72,9 +72,9 @@ MOST = 0.95
 """Of a share, so that a place's rate can change."""
 PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
-REMAINING_MEAN = 0.368
-"""Mean of the lower three quarters of squared normal deviates: F(1.323) / 0.75, with F the
-distribution function of chi-squared with 3 degrees of freedom."""
+REMAINING_MEAN = 0.1427
+"""Mean of the lower half of squared normal deviates: F(0.455) / 0.5, with F the distribution
+function of chi-squared with 3 degrees of freedom."""
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -167,7 +167,7 @@ class Papillae(Detector):
             if len(w) >= FEWEST_PLACES and n.sum() > 0:
                 expected = n.sum() * w / w.sum()
                 squares = np.sort((n - expected) ** 2 / expected)
-                found = squares[: len(w) - len(w) // 4].mean() / REMAINING_MEAN
+                found = squares[: len(w) - len(w) // 2].mean() / REMAINING_MEAN
         self._dispersions = np.append(self._dispersions[1:], found)
 
 
@@ -288,7 +288,7 @@ def _advance(
                 moved = _page(pushed[j], DISTURBED, seen, all_seen, min(share, MOST / DISTURBED))
                 pushed[j] = min(moved, LARGEST)
             touched[0] = TOUCHED_MS if pushed.max() >= TOUCHED else max(touched[0] - 1, 0)
-            most = rest.max() / (scale * (TOUCHED_SCALE if touched[0] > 0 else 1.0))
+            most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if touched[0] > 0 else 1.0))
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]
 

@@ -123,7 +123,7 @@ def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 15), (60000.0, 25)])
+@pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 20), (60000.0, 30)])
 def test_a_marker_that_comes_to_rest_is_seen_at_once(
     seed: int, noise_hz: float, within_ms: int
 ) -> None:
@@ -187,5 +187,5 @@ def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
 
 
 def test_the_mean_of_the_remaining_squares_is_that_of_normal_deviates() -> None:
-    most = chi2.ppf(0.75, 1)
-    assert pytest.approx(chi2.expect(lambda x: x, (1,), ub=most) / 0.75, abs=1e-3) == REMAINING_MEAN
+    most = chi2.ppf(0.5, 1)
+    assert pytest.approx(chi2.expect(lambda x: x, (1,), ub=most) / 0.5, abs=1e-4) == REMAINING_MEAN
