@@ -14,14 +14,17 @@ Every millisecond:
    papillae alike leaves the shares as they were.
 3. **Page's test** (Page 1954, Biometrika 41): a place's share of the current millisecond's events
    is a tenth of what it was, or its noise, against as it was; the likelihoods are binomial. Places
-   that may be at rest, or that cause twice the events, do not count as the others.
+   that may be at rest, or that cause twice the events, do not count as the others. A millisecond
+   with more events than usual says no more than a usual one: events of a knock come in bursts that
+   are not independent.
 4. **Dispersion**: the test's statistic is divided by the square of how much more the other places'
    shares vary than by chance (Pearson's statistic per degree of freedom, McCullagh & Nelder 1989,
-   section 4.5). An object that brushes over single papillae changes their shares all the time. The
-   quarter of the places that differ most are left out: they may be the tips that slide.
+   section 4.5). The half of the places that differ most is left out: they may be the tips that
+   slide. While an object brushes over single papillae, which shows by places with far more events
+   than before, the statistic is divided by `TOUCHED_SCALE` too.
 
-Evidence is the largest statistic of all places from `LEAST` on; 0 below, and while fewer than
-`FEWEST_PLACES` of them move.
+Evidence is the sum of the two largest statistics of all places from `LEAST` on, since tips let go
+one after the other; 0 below, and while fewer than `FEWEST_PLACES` of them move.
 """
 
 from __future__ import annotations
@@ -57,17 +60,21 @@ AT_REST, DISTURBED = 0.1, 2.0
 """Rates of a place whose tip slides, and of one that is pushed, by what it had before."""
 SUSPECTED = 6.0
 """Statistic from which a place does not count as one of the others."""
-LEAST = 13.0
+LEAST = 12.0
 """Statistic below which nothing is evidence: a knock against the arm reaches up to this."""
+TOUCHED = 20.0
+"""Statistic of a pushed place from which another object touches it; slides reach about 15."""
+TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
+"""An object that let go pulls the papillae's motion about for so long."""
 LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
 MOST = 0.95
 """Of a share, so that a place's rate can change."""
 PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
-REMAINING_MEAN = 0.368
-"""Mean of the lower three quarters of squared normal deviates: F(1.323) / 0.75, with F the
-distribution function of chi-squared with 3 degrees of freedom."""
+REMAINING_MEAN = 0.1427
+"""Mean of the lower half of squared normal deviates: F(0.455) / 0.5, with F the distribution
+function of chi-squared with 3 degrees of freedom."""
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -85,6 +92,7 @@ class Papillae(Detector):
         self._place = np.full(self._shape[0] * self._shape[1], -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
+        self._touched = np.zeros(1, np.int64)
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
@@ -137,7 +145,7 @@ class Papillae(Detector):
             self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise
         )
         scale = self._dispersion() ** 2
-        _advance(counts, self._noise, self._rest, self._pushed, scale, value)
+        _advance(counts, self._noise, self._rest, self._pushed, self._touched, scale, value)
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""
@@ -159,7 +167,7 @@ class Papillae(Detector):
             if len(w) >= FEWEST_PLACES and n.sum() > 0:
                 expected = n.sum() * w / w.sum()
                 squares = np.sort((n - expected) ** 2 / expected)
-                found = squares[: len(w) - len(w) // 4].mean() / REMAINING_MEAN
+                found = squares[: len(w) - len(w) // 2].mean() / REMAINING_MEAN
         self._dispersions = np.append(self._dispersions[1:], found)
 
 
@@ -242,12 +250,15 @@ def _counts(ms: I64, cell: I64, oldest: int, number: int, place: I64, noise: F64
 
 
 @njit(cache=True, nogil=True)
-def _advance(counts: I64, noise: F64, rest: F64, pushed: F64, scale: float, value: F64) -> None:
+def _advance(
+    counts: I64, noise: F64, rest: F64, pushed: F64, touched: I64, scale: float, value: F64
+) -> None:
     """Advance the statistics of the places, and write the evidence.
 
     Args:
         counts: as of `_counts`. noise: events a millisecond of each place.
         rest, pushed: statistics, which are changed. scale: square of the dispersion.
+        touched: milliseconds for which an object still counts as touching; changed, shape (1,).
         value: of each millisecond.
     """
     places = len(rest)
@@ -262,6 +273,7 @@ def _advance(counts: I64, noise: F64, rest: F64, pushed: F64, scale: float, valu
             pushed[:] = 0.0
         else:
             all_n, all_w = n[others].sum(), memory[others].sum()
+            weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
             for j in range(places):
                 if not moving[j]:
                     rest[j] = pushed[j] = 0.0
@@ -271,10 +283,12 @@ def _advance(counts: I64, noise: F64, rest: F64, pushed: F64, scale: float, valu
                 total = all_n + alone * n[j]
                 share = min(w / (all_w + alone * w), MOST)
                 silent = min(AT_REST + (1 - AT_REST) * noise[j] * MEMORY_MS / w, MOST)
-                rest[j] = _page(rest[j], silent, n[j], total, share)
-                moved = _page(pushed[j], DISTURBED, n[j], total, min(share, MOST / DISTURBED))
+                seen, all_seen = weight * n[j], weight * total
+                rest[j] = _page(rest[j], silent, seen, all_seen, share)
+                moved = _page(pushed[j], DISTURBED, seen, all_seen, min(share, MOST / DISTURBED))
                 pushed[j] = min(moved, LARGEST)
-            most = rest.max() / scale
+            touched[0] = TOUCHED_MS if pushed.max() >= TOUCHED else max(touched[0] - 1, 0)
+            most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if touched[0] > 0 else 1.0))
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]
 

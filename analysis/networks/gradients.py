@@ -14,6 +14,7 @@ Gradients agree to rounding, so a training on a GPU ends with other last bits.
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -200,14 +201,15 @@ class ExactConvolution(nn.Conv2d):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the convolution of `torch.nn.Conv2d`, in full float32."""
-        size, stride = self.kernel_size, self.stride
-        pads = cast(tuple[int, int], self.padding)
-        rows, columns = (
-            (side + 2 * pad - kernel) // step + 1
-            for side, pad, kernel, step in zip(x.shape[2:], pads, size, stride, strict=True)
-        )
-        taps = nn.functional.unfold(x, size, padding=pads, stride=stride)
-        return (self.weight.flatten(1) @ taps).unflatten(2, (rows, columns))
+        row_pad, column_pad = cast(tuple[int, int], self.padding)
+        taps = nn.functional.pad(x, (column_pad, column_pad, row_pad, row_pad))
+        # views: torch.nn.functional.unfold launches some kernels for each image
+        for axis, (size, stride) in enumerate(
+            zip(self.kernel_size, self.stride, strict=True), start=2
+        ):
+            taps = taps.unfold(axis, size, stride)
+        sums = taps.permute(0, 2, 3, 1, 4, 5).flatten(3) @ self.weight.flatten(1).T
+        return sums.permute(0, 3, 1, 2)
 
 
 def exact_net(net: nn.Sequential) -> nn.Sequential:
@@ -275,6 +277,37 @@ def on_device(net: nn.Sequential, gain: float, device: str) -> OnDevice:
     return OnDevice(net, gain, device, compiled=reason is None)
 
 
+@dataclass(frozen=True)
+class HeldWindows:
+    """Windows whose cells lie on a device: a batch is scattered there, and nothing is copied."""
+
+    windows: SparseWindows
+    begin: torch.Tensor
+    size: torch.Tensor
+    cell: torch.Tensor
+    count: torch.Tensor
+
+    @staticmethod
+    def of(windows: SparseWindows, device: str) -> HeldWindows:
+        offsets = torch.from_numpy(windows.offsets).to(device)
+        cell = torch.from_numpy(windows.cell.astype(np.int32)).to(device)
+        count = torch.from_numpy(windows.count).to(device)
+        steps = windows.shape[0]
+        begin, size = offsets[:-1].view(-1, steps), offsets.diff().view(-1, steps)
+        return HeldWindows(windows, begin, size, cell, count)
+
+    def dense(self, rows: IntArray) -> torch.Tensor:
+        """Counts float32 (n, steps, channels, rows, columns)."""
+        chosen = torch.from_numpy(np.asarray(rows, np.int64)).to(self.begin.device)
+        begin, size = self.begin[chosen].flatten(), self.size[chosen].flatten()
+        ends = size.cumsum(0)
+        plane = torch.repeat_interleave(size)
+        entry = torch.arange(len(plane), device=plane.device) + (begin - ends + size)[plane]
+        flat = torch.zeros(len(size), math.prod(self.windows.shape[1:]), device=plane.device)
+        flat[plane, self.cell[entry]] = self.count[entry].float()
+        return flat.view(len(rows), *self.windows.shape)
+
+
 class OnDevice:
     """The whole network by torch on one device.
 
@@ -292,6 +325,7 @@ class OnDevice:
         _check(device)
         self._net = (compiled_net(net) if compiled else exact_net(net)).to(device)
         self._gain, self._device = gain, device
+        self._held: HeldWindows | None = None
         self._fired: dict[str, torch.Tensor] = {}
         for name in SPIKING:
             getattr(self._net, name).register_forward_hook(self._count(name))
@@ -308,7 +342,9 @@ class OnDevice:
 
     def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> GradientBatch:
         """Compute the whole batch at once; the pool is not used."""
-        dense = torch.from_numpy(x.take(rows).dense()).to(self._device, torch.float32)
+        if self._held is None or self._held.windows is not x:
+            self._held = HeldWindows.of(x, self._device)
+        dense = self._held.dense(rows)
         reset_states(self._net)
         with _exact_sums():
             spikes = self._net(dense.flatten(0, 1)).unflatten(0, (len(rows), -1))

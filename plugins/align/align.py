@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.plugins.align.clock_state import ClockState
@@ -43,8 +44,8 @@ _MOST_OUTSIDE = 0.4
 _BETWEEN = 8
 """Up to so many unpaired events between two stretches, the clock jumped once there."""
 _JUMP, _DOUBT = 12.0, 5.0
-"""Log-likelihood that a jump gains, to be one or to be in doubt: chance gives the first once in
-about a million places."""
+"""Log-likelihood that a jump gains, to be one, or to be as likely as none: chance gives the first
+once in about a million places."""
 _NEAR = 64
 """Events on either side of a break among which the jump is placed."""
 _UNLIKELY = 10.0
@@ -395,7 +396,8 @@ class _Fit:
         if step is not None and step.gain > _JUMP:
             at = step.at
             halves = Run(run.a[:at], run.b[:at]), Run(run.a[at:], run.b[at:])
-            return [part for half in halves for part in self._split(piece, half, least // 2)]
+            least = max(least // 2, MIN_KNOWN)
+            return [part for half in halves for part in self._split(piece, half, least)]
         inside = ~state.outside
         if inside.mean() < 1 - _MOST_OUTSIDE:
             return []
@@ -405,7 +407,10 @@ class _Fit:
         state = self._state(run)
         step = state.jump(min(MIN_KNOWN, run.a.size // 3))
         # one that may be there, and would be half as wrong on either side
-        doubt = abs(step.size) / 2 if step is not None and step.gain > _DOUBT else 0.0
+        doubt = 0.0
+        if step is not None:
+            likely = float(special.expit(1.5 * (step.gain - _DOUBT)))
+            doubt = likely * abs(step.size) / 2
         # what a unit hides that no jitter shakes (Widrow and Kollar 2008)
         shaken = state.sigma / self.unit
         doubt += 0.5 * self.unit * float(np.exp(-2 * np.pi**2 * shaken**2))
@@ -447,11 +452,19 @@ class _Fit:
         )
 
     def _unclear(self, parts: list[_Part]) -> tuple[tuple[int, int], ...]:
-        """Return the times of A's pieces that could not be aligned."""
+        """Return the times of A's pieces that could not be aligned.
+
+        A piece goes on beyond its outermost events for up to the longest interval of events.
+        """
         found = []
+        longest = max(
+            float(np.diff(times[begin:end]).max(initial=0.0))
+            for times, pieces in ((self.x, self.pieces_a), (self.y, self.pieces_b))
+            for begin, end in pairwise(pieces)
+        )
         for piece, (begin, end) in enumerate(pairwise(self.pieces_a)):
             if end - begin > _BETWEEN and all(part.piece != piece for part in parts):
-                first, last = self.x[begin], self.x[end - 1]
+                first, last = self.x[begin] - longest, self.x[end - 1] + longest
                 found.append((self.origin_a + int(first), self.origin_a + int(last)))
         return tuple(found)
 
@@ -550,7 +563,7 @@ def _until(run: Run, end: int) -> Run:
 
 
 def _from(run: Run, begin: int) -> Run:
-    keep = min(int(np.searchsorted(run.a, begin)), run.a.size - MIN_KNOWN)
+    keep = max(min(int(np.searchsorted(run.a, begin)), run.a.size - MIN_KNOWN), 0)
     return Run(run.a[keep:], run.b[keep:])
 
 

@@ -101,13 +101,29 @@ def brushed(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return RATE_HZ * np.exp(-(front**2) / 0.5)
 
 
+def jolted(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Markers move slowly; for 60 ms a knock shakes each of them in its own way, ten times faster."""
+    phase = 2.4 * np.arange(len(CENTRES))
+    own = 0.5 + 0.5 * np.sin(2 * np.pi * 60 * t[:, None] + phase)
+    knock = (t > SLIP_S) & (t < SLIP_S + 0.06)
+    return moving(t) / 4 * np.where(knock[:, None], 1 + 15 * own, 1.0)
+
+
+def held_back(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """An object pushes three neighbours while all move, and holds one of them for 60 ms."""
+    rates = moving(t)
+    rates[(t > SLIP_S) & (t < SLIP_S + 0.06), -3:] *= 4
+    rates[(t > SLIP_S + 0.06) & (t < SLIP_S + 0.12), -1] = 0.0
+    return rates
+
+
 def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Noise alone."""
     return np.zeros((len(t), len(CENTRES)))
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 15), (60000.0, 25)])
+@pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 20), (60000.0, 30)])
 def test_a_marker_that_comes_to_rest_is_seen_at_once(
     seed: int, noise_hz: float, within_ms: int
 ) -> None:
@@ -117,7 +133,9 @@ def test_a_marker_that_comes_to_rest_is_seen_at_once(
     assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
 
 
-@pytest.mark.parametrize("rates", [moving, slower, stopping, shaken, brushed, still])
+@pytest.mark.parametrize(
+    "rates", [moving, slower, stopping, shaken, brushed, jolted, held_back, still]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_moves_all_alike_and_what_pushes_single_ones_is_no_slip(
     rates: Rates, seed: int
@@ -169,5 +187,5 @@ def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
 
 
 def test_the_mean_of_the_remaining_squares_is_that_of_normal_deviates() -> None:
-    most = chi2.ppf(0.75, 1)
-    assert pytest.approx(chi2.expect(lambda x: x, (1,), ub=most) / 0.75, abs=1e-3) == REMAINING_MEAN
+    most = chi2.ppf(0.5, 1)
+    assert pytest.approx(chi2.expect(lambda x: x, (1,), ub=most) / 0.5, abs=1e-4) == REMAINING_MEAN

@@ -141,6 +141,15 @@ def test_convolutions_as_products_give_the_same() -> None:
     assert not isinstance(net.conv1, gradients.ExactConvolution)
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=GPU)])
+def test_windows_are_scattered_on_the_device_as_on_the_host(device: str) -> None:
+    x, _ = samples(20, 3)
+    held = gradients.HeldWindows.of(x, device)
+    for rows in (np.array([3, 17, 3, 0]), np.arange(20), np.array([0])):
+        expected = x.take(rows).dense().astype(np.float32)
+        np.testing.assert_array_equal(held.dense(rows).cpu().numpy(), expected)
+
+
 def test_where_nothing_compiles_sinabs_computes_and_it_is_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

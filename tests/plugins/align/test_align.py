@@ -211,3 +211,39 @@ def test_a_straight_clock_has_the_interval_of_least_squares(n: int) -> None:
     assert (half < (1.01 if n < 12 else 2.0) * expected).all()
     if n < 12:
         np.testing.assert_allclose(gain, slope * asked + level, atol=1e-2 * half.min())
+
+
+def test_times_beside_a_piece_that_could_not_be_aligned_are_unknown() -> None:
+    # ten events, too few for a pattern, then A falls back
+    b = _random_events(120)
+    a = np.where(np.arange(120) < 10, b, b - 3.0)
+    found = sliplab.align(a, b)
+    (stretch,) = found.stretches
+    assert stretch.events >= 100
+    begin, end = int(1e9 * a[0]), int(1e9 * a[9])
+    ((low, high),) = found.unclear_ns
+    # the clock may have fallen back anywhere between two events
+    assert low < begin
+    assert high > end + int(1e9 * (b[10] - b[9]))
+    asked = np.array([begin, end, end + 10_000_000, int(1e9 * a[60])])
+    assert found.map(asked).known.tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_clock_that_jumps_every_few_events_is_refused_or_right(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    b = _random_events(200, seed)
+    steps = np.zeros(200)
+    places = np.cumsum(rng.integers(3, 40, 30))
+    places = places[places < 200]
+    steps[places] = rng.choice([-1, 1], places.size) * 10 ** rng.uniform(-4, 0, places.size)
+    clock = b + np.cumsum(steps)
+    a, ids = clock + rng.normal(0, 1e-5, 200), np.arange(200)
+    try:
+        found = sliplab.align((a, ids), (b, ids))
+    except AlignmentRefused:
+        return
+    mapped = found.map(clock)
+    half = (mapped.high_ns - mapped.low_ns) / 2
+    off = np.abs(mapped.ns - np.rint(1e9 * b))
+    assert (off <= 3 * half)[mapped.within].all()
