@@ -26,6 +26,7 @@ def run_evaluation(
     engine: str | None = None,
     predictions: Path | pd.DataFrame | None = None,
     dask: str | None = None,
+    promise: float | None = None,
 ) -> dict[str, Any]:
     """Score a network on the test trials.
 
@@ -38,6 +39,7 @@ def run_evaluation(
         model, engine: a model file instead of the store's network, and what counts its spikes.
         predictions: of another program, instead; see `analysis.evaluation.predictions`.
         dask: the scheduler whose workers take the trials.
+        promise: false alarms an hour, at most, at which the store's detectors are compared, too.
 
     Returns:
         the step's result; of `model` and `predictions` a `flows.judge_network.NetworkScores`.
@@ -53,7 +55,8 @@ def run_evaluation(
     if model is not None and predictions is not None:
         raise InputError("--predictions", "", None, "cannot be given with --model")
     if model is not None or predictions is not None:
-        for name, chosen in (("--baselines", baselines), ("--checks", checks)):
+        alone = (("--baselines", baselines), ("--checks", checks), ("--promise", promise))
+        for name, chosen in alone:
             if chosen:
                 raise InputError(name, "", None, "applies only to the store's own network")
     if predictions is not None:
@@ -62,7 +65,7 @@ def run_evaluation(
     if model is not None:
         options |= {"model": model, "engine": engine}
         return {**run_step(folder, names, "judge_model", dask, **options)}
-    done: dict[str, Any] = {**run_step(folder, names, "evaluate", dask, **options)}
+    done: dict[str, Any] = {**run_step(folder, names, "evaluate", dask, promise=promise, **options)}
     for step, chosen in (("window_baselines", baselines), ("window_checks", checks)):
         if chosen:
             done[step] = run_step(folder, names, step, reviewed=reviewed)

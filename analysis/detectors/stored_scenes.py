@@ -9,9 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.detectors.alarms import promised_levels
 from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
-from sliplab.analysis.detectors.detector_comparison import TrialEvidence, allowed_early, set_levels
+from sliplab.analysis.detectors.detector_comparison import (
+    TrialEvidence,
+    allowed_early,
+    scenes_of,
+    set_levels,
+)
 from sliplab.analysis.detectors.detectors import WindowEvidence
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
@@ -22,11 +28,14 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
 
-def fitted_to(store: Store, detector: Detector) -> AtLevel:
+def fitted_to(store: Store, detector: Detector, promise: float | None = None) -> AtLevel:
     """Return a detector that the store's training trials trained, at the level of its validation.
 
     The level is that of the detector comparison: the lowest at which at most the middle one of
-    `compare.rates` of the validation trials are false early.
+    `compare.rates` of the validation trials are false early, or that which promises a rate.
+
+    Args:
+        promise: false alarms an hour without slip, at most.
 
     Raises:
         StoreError: no training or validation trial has both onsets, or one has no events.
@@ -39,8 +48,12 @@ def fitted_to(store: Store, detector: Detector) -> AtLevel:
     validation = scenes(labels, campaigns, "validation")
     detector.train(train, validation)
     judged = [TrialEvidence(_windows(feed(detector, it)), _slip(it)) for it in validation]
+    tolerance = round(rule.false_early_ms * 1e6)
+    if promise is not None:
+        (level,) = promised_levels(scenes_of(judged, tolerance), [promise])
+        return AtLevel(detector, level.value, level)
     rate = asked.rates[len(asked.rates) // 2]
-    levels = set_levels(judged, allowed_early(rate, len(judged)), round(rule.false_early_ms * 1e6))
+    levels = set_levels(judged, allowed_early(rate, len(judged)), tolerance)
     return AtLevel(detector, levels.incipient)
 
 

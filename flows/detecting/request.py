@@ -8,6 +8,7 @@ from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
@@ -41,6 +42,8 @@ class DetectRequest:
         safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until the user ends it.
+        promise: false alarms an hour, at most, that are watched; None without a promise.
+        set_by: the promise that set a tuned detector's level.
     """
 
     rig: RigFile
@@ -50,6 +53,8 @@ class DetectRequest:
     reflex: Reflex | None = None
     safe: Reflex | None = None
     seconds: float | None = None
+    promise: float | None = None
+    set_by: Level | None = None
 
     @property
     def answer_s(self) -> float | None:
@@ -94,12 +99,15 @@ def make_detect_request(
     smoothing: int | None = None,
     poll_s: float = POLL_S,
     detector: Tuned | NamedSource | None = None,
+    promise: float | None = None,
+    set_by: Level | None = None,
 ) -> DetectRequest:
     """Read and check everything that can be known before anything moves.
 
     Args:
         model: a network; None where `detector` is another one.
         detector: instead of the network with the protocol's rule, or instead of the rule.
+        promise, set_by: as `DetectRequest`.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
@@ -125,6 +133,8 @@ def make_detect_request(
             rig=_read_often(file, poll_s),
             source=source(None),
             seconds=seconds,
+            promise=promise,
+            set_by=set_by,
         )
     if seconds is not None:
         right = "applies only without --protocol; a trial lasts as long as its motion"
@@ -141,6 +151,8 @@ def make_detect_request(
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
         safe=None if reflex is None else make_safe_state(file, plan),
+        promise=promise,
+        set_by=set_by,
     )
 
 

@@ -92,11 +92,14 @@ class NamedSource:
     Attributes:
         level: that its evidence must exceed; None: validation trials of `store` set it.
         store: whose trials train it; None where it needs no training.
+        promise: false alarms an hour, at most, at which validation trials set the level; None: at
+            a share of them that is false early.
     """
 
     name: str
     level: float | None
     store: Path | None
+    promise: float | None = None
 
     @property
     def title(self) -> str:
@@ -110,7 +113,7 @@ class NamedSource:
 
     def detector(self) -> AtLevel:
         """Return the detector in this process; see `named_detector`."""
-        return named_detector(self.name, self.level, self.store)
+        return named_detector(self.name, self.level, self.store, self.promise)
 
     @contextmanager
     def running(
@@ -125,14 +128,17 @@ class NamedSource:
             with closing(self.detector()) as made:
                 yield made
             return
-        with closing(DetectorProcess(self.name, self.level, self.store, answer_s)) as process:
-            yield AtLevel(process, process.level)
+        given = self.name, self.level, self.store, self.promise
+        with closing(DetectorProcess(*given, answer_s=answer_s)) as process:
+            yield AtLevel(process, process.level, process.set_by)
 
 
 Source: TypeAlias = NetworkSource | NamedSource
 
 
-def named_source(name: str, level: float | None, store: Path | None) -> NamedSource:
+def named_source(
+    name: str, level: float | None, store: Path | None, promise: float | None = None
+) -> NamedSource:
     """Check that a detector can be had.
 
     Raises:
@@ -147,4 +153,4 @@ def named_source(name: str, level: float | None, store: Path | None) -> NamedSou
     if store is None and level is None:
         right = f"is needed, or a store as --model, whose validation trials set it for '{name}'"
         raise InputError("--level", "", None, right)
-    return NamedSource(name, level, store)
+    return NamedSource(name, level, store, promise)
