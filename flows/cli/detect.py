@@ -31,7 +31,11 @@ def detect(
     rig: RigOption,
     model: Annotated[
         Path | None,
-        typer.Option("--model", help="A trained network, models/seed0.pt, or a store with one."),
+        typer.Option(
+            "--model",
+            help="A trained network, models/seed0.pt, a store with one, or a .json of `sliplab "
+            "calibrate detector`.",
+        ),
     ] = None,
     detector: Annotated[
         str,
@@ -141,6 +145,11 @@ def _chosen(
         InputError: there is no such detector, or it has no such option.
         StoreError: a network of the store is missing or stale.
     """
+    if model is not None and model.suffix == ".json":
+        if detector != "network":
+            right = f"cannot be given with {model}, which is a detector"
+            raise InputError("--detector", "", detector, right)
+        model, detector = None, str(model)
     store = model if model is not None and model.is_dir() else None
     if store is not None:
         from sliplab.flows.steps import prepare_store

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
@@ -107,7 +106,7 @@ def make_detect_request(
     Args:
         model: a network; None where `detector` is another one.
         detector: instead of the network with the protocol's rule, or instead of the rule.
-        promise, set_by: as `DetectRequest`.
+        promise, set_by: as `DetectRequest`. By default a calibrated detector's own promise.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
@@ -117,7 +116,10 @@ def make_detect_request(
     change = {name: value for name, value in given if value is not None}
     source: Callable[[AnalysisSettings | None], Source]
     if isinstance(detector, NamedSource):
+        detector.check_rig(file)
         source = partial(_named, detector)
+        if promise is None and detector.skin is not None:
+            promise = detector.skin.hold.high
     else:
         assert model is not None
         source = _network(model, stride_ms, detector, change)
@@ -130,7 +132,7 @@ def make_detect_request(
             right = f"is needed on {file.name}: its time is virtual and has no end"
             raise InputError("--seconds", "", None, right)
         return DetectRequest(
-            rig=_read_often(file, poll_s),
+            rig=file.read_at_least(poll_s),
             source=source(None),
             seconds=seconds,
             promise=promise,
@@ -145,7 +147,7 @@ def make_detect_request(
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     chosen = choose_trial(plan, trial)
     return DetectRequest(
-        rig=_read_often(with_level(file, plan) if file.simulated else file, poll_s),
+        rig=(with_level(file, plan) if file.simulated else file).read_at_least(poll_s),
         source=source(plan.protocol.analysis),
         plan=plan,
         trial=chosen,
@@ -154,11 +156,6 @@ def make_detect_request(
         promise=promise,
         set_by=set_by,
     )
-
-
-def _read_often(file: RigFile, poll_s: float) -> RigFile:
-    """Return a rig that reads its streams at least this often."""
-    return file.model_copy(update={"poll": min(file.poll, Decimal(str(poll_s)))})
 
 
 def _named(source: NamedSource, stated: AnalysisSettings | None) -> Source:
