@@ -127,7 +127,7 @@ class SkinMeasurement(NullSink):
             rub = self._rubs[-1]
             rub.begin_us = made[0].start_us if rub.begin_us is None else rub.begin_us
             if not max(rub.value, default=0.0) > 0:
-                rub.places = max(rub.places, self._places(), key=len)
+                rub.places = self._places() or rub.places
             rub.t_us += [decision.end_us for decision in made]
             rub.value += [decision.value for decision in made]
 

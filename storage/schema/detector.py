@@ -21,7 +21,7 @@ class Rub(Part):
 
     direction_deg: Number
     places: Int
-    """Most places that moved at once before the alarm."""
+    """Places that moved at once when the first evidence came."""
     largest: Number
     """Largest evidence."""
     alarm_ms: Number | None
