@@ -42,6 +42,7 @@ from sliplab.analysis.detectors.onset_references import (
     Decided,
     References,
     judge_by_reference,
+    still_until_ns,
 )
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.detection import ComparisonSettings, Detection
@@ -123,17 +124,17 @@ def _highest(values: Any, evidence: WindowEvidence, start: int, before_ns: int) 
 def scenes_of(trials: Sequence[TrialEvidence], false_early_ns: int) -> list[SceneEvidence]:
     """Return trials as scenes that begin with their first window's end.
 
-    An alarm before the label's onset is false, unless by less than `false_early_ns`: a tip may
-    slide before a marker has moved by 2 pixels.
+    They are still until `still_until_ns`.
     """
     found = []
     for trial in trials:
         end_ns, slip = trial.evidence.end_ns, trial.slip
         begin_ns = int(end_ns[0]) if len(end_ns) else slip.incipient_ns
-        onset_us = max(slip.incipient_ns - false_early_ns - begin_ns, 0) // 1000
-        gross_us = (slip.gross_ns - begin_ns) // 1000
+        still_ns = still_until_ns(slip, trial.references, false_early_ns)
+        still_us = max(still_ns - begin_ns, 0) // 1000
+        onset_us, gross_us = ((at - begin_ns) // 1000 for at in (slip.incipient_ns, slip.gross_ns))
         evidence = Evidence.of((end_ns - begin_ns) // 1000, trial.evidence.incipient)
-        found.append(SceneEvidence(evidence, Slip(onset_us, onset_us, gross_us)))
+        found.append(SceneEvidence(evidence, Slip(still_us, onset_us, gross_us)))
     return found
 
 

@@ -6,11 +6,20 @@ from pathlib import Path
 
 from sliplab.analysis.detectors.papillae import VERSION, Papillae, PapillaeSettings
 from sliplab.protocols.errors import InputError
+from sliplab.storage.files import read_json
 from sliplab.storage.schema.detector import DetectorCalibration
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 
 SUFFIX = ".json"
 NAME = "papillae"
+
+
+def is_calibration(path: Path) -> bool:
+    """Return whether a file is a calibration; a network's description is JSON, too."""
+    try:
+        return path.suffix == SUFFIX and "detector" in read_json(path)
+    except (OSError, ValueError):
+        return False
 
 
 def load_calibration(path: Path) -> DetectorCalibration:
