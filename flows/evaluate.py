@@ -95,12 +95,10 @@ def evaluate(
     folder = Derived.of(store, STEP).folder
     if stale or not (folder / FILE).exists():
         write_scores(problem, problem.numbers(), folder)
-    done: EvaluateDone = {
-        "step": "evaluate",
-        "done": int(stale),
-        "fresh": int(not stale),
-        **report_states(labels, campaigns),
-    }
+    done: EvaluateDone = {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}
+    states = report_states(labels, campaigns)
+    if "reviewed" in states:
+        done["reviewed"] = states["reviewed"]
     if promise is not None:
         assert isinstance(job, EvaluationJob)
         done["promise"] = _promises(job, promise)

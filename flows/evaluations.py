@@ -67,8 +67,8 @@ def run_evaluation(
         options["predictions"] = predictions
         return {**run_step(folder, names, "judge_predictions", dask, **options)}
     if model is not None and is_calibration(model):
-        alone = (("--margin", margin), ("--smoothing", smoothing), ("--engine", engine))
-        for name, given in alone:
+        of_networks = (("--margin", margin), ("--smoothing", smoothing), ("--engine", engine))
+        for name, given in of_networks:
             if given is not None:
                 raise InputError(name, "", given, f"is of networks, and {model} is a detector")
         return {**run_step(folder, names, "judge_detector", dask, model=model, reviewed=reviewed)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -99,6 +99,6 @@ def judge_detector(
         "missed": missed,
         "early": sum(one.early for one in outcomes),
         "false_alarms": false_alarm_rate(found, skin.level),
-        "median_ms": cast("float | None", median_with_lost(late_ms, missed, np.inf)),
+        "median_ms": median_with_lost(late_ms, missed, np.inf),
         **report_states(labels, campaigns),
     }
