@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.detectors.alarms import BOUND_OF_NONE
 from sliplab.analysis.detectors.at_level import AtLevel
-from sliplab.analysis.detectors.live import LiveDetector
+from sliplab.analysis.detectors.live import LiveDecision, LiveDetector
 from sliplab.analysis.detectors.papillae import (
     FEWEST_PLACES,
     LEAST,
@@ -34,6 +34,8 @@ FEWEST = 3
 """Places of the smallest skin that can be compared with each other."""
 HOT_EVENTS = 5
 """Of a cell at rest beyond noise: more than chance gives any of 4,800."""
+PART_US = 10_000
+"""Events evaluated at once."""
 US_PER_HOUR = 3_600_000_000
 
 
@@ -48,12 +50,17 @@ def fewest_places(papillae: int) -> int:
 
 @dataclass
 class _Rubbed:
-    """A rub so far; times of decisions on the camera's clock."""
+    """A rub so far; times of decisions on the camera's clock.
+
+    Attributes:
+        places: the last ones before the first evidence. most: of them at once.
+    """
 
     begin_us: int | None = None
     t_us: list[int] = field(default_factory=list)
     value: list[float] = field(default_factory=list)
     places: tuple[PapillaPlace, ...] = ()
+    most: int = 0
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,13 @@ class SkinMeasurement(NullSink):
             self._at_rest += np.bincount(cell, minlength=len(self._at_rest))
             self._rest_us += [int(chunk.t_us.min()), int(chunk.t_us.max())]
             return
-        made = self._live.push(chunk)
+        events = chunk[np.argsort(chunk.t_us, kind="stable")]
+        # in short parts, so that places are those just before the slip, however late a read is
+        edges = np.arange(int(events.t_us[0]) + PART_US, int(events.t_us[-1]), PART_US)
+        for part in np.split(np.arange(len(events)), np.searchsorted(events.t_us, edges)):
+            self._take(self._live.push(events[part]))
+
+    def _take(self, made: Sequence[LiveDecision]) -> None:
         if not made:
             return
         largest = max(decision.value for decision in made)
@@ -128,6 +141,7 @@ class SkinMeasurement(NullSink):
             rub.begin_us = made[0].start_us if rub.begin_us is None else rub.begin_us
             if not max(rub.value, default=0.0) > 0:
                 rub.places = self._places() or rub.places
+                rub.most = max(rub.most, len(rub.places))
             rub.t_us += [decision.end_us for decision in made]
             rub.value += [decision.value for decision in made]
 
@@ -171,7 +185,14 @@ class SkinMeasurement(NullSink):
             settings=self._papillae.settings,
             cell_px=self._papillae.cell_px,
             noise_hz=float(np.median(self._at_rest)) / self._rest_s,
-            places=max((rubbed.places for rubbed in self._rubs), key=len),
+            places=max(
+                (
+                    rubbed.places
+                    for rubbed, rub in zip(self._rubs, rubs, strict=True)
+                    if rub.alarm_ms is not None
+                ),
+                key=len,
+            ),
             level=level,
             hold=hold,
             hold_largest=self._largest[HOLD],
@@ -215,7 +236,7 @@ def _rub(direction_deg: float, rubbed: _Rubbed, level: float) -> Rub:
         alarm_ms = (above[0] - rubbed.begin_us) / 1000
     return Rub(
         direction_deg=direction_deg,
-        places=len(rubbed.places),
+        places=rubbed.most,
         largest=max(rubbed.value, default=0.0),
         alarm_ms=alarm_ms,
     )

@@ -21,7 +21,7 @@ class Rub(Part):
 
     direction_deg: Number
     places: Int
-    """Places that moved at once when the first evidence came."""
+    """Most places that moved at once before the first evidence."""
     largest: Number
     """Largest evidence."""
     alarm_ms: Number | None
@@ -53,7 +53,7 @@ class DetectorCalibration(Document):
     fewest_places: Int
     """Places that move at once in a slide."""
     places: tuple[PapillaPlace, ...]
-    """Of the rub with the most; the detector follows markers and finds them anew."""
+    """Before the first evidence, of the rub with the most then; the detector follows markers and finds them anew."""
     level: Number
     """Evidence above it is an alarm: at least the largest one of hold and unload."""
     hold: AlarmRate
