@@ -53,7 +53,8 @@ class DetectorCalibration(Document):
     fewest_places: Int
     """Places that move at once in a slide."""
     places: tuple[PapillaPlace, ...]
-    """Before the first evidence, of the rub with the most then; the detector follows markers and finds them anew."""
+    """Just before the first evidence, of the rub with the most; the detector finds its places anew,
+    as markers move."""
     level: Number
     """Evidence above it is an alarm: at least the largest one of hold and unload."""
     hold: AlarmRate
