@@ -153,6 +153,7 @@ class Store:
         baselines: bool = False,
         checks: bool = False,
         dask: str | None = None,
+        promise: float | None = None,
     ) -> dict[str, Any]:
         """Judge the network on test trials; or a model file, or any model by its predictions.
 
@@ -160,7 +161,8 @@ class Store:
             predictions: a row for each window that `windows` lists for ``test``, as a table or its
                 file; docs/models.md describes its columns.
             model: a model file.
-            engine, margin, smoothing, reviewed, baselines, checks, dask: see ``sliplab evaluate``.
+            engine, margin, smoothing, reviewed, baselines, checks, dask, promise: see ``sliplab
+                evaluate``.
 
         Raises:
             InputError: an argument, or predictions that do not fit, with all their faults.
@@ -184,6 +186,7 @@ class Store:
                 engine=engine,
                 predictions=predictions,
                 dask=dask,
+                promise=promise,
             )
 
     def windows(

@@ -8,6 +8,7 @@ stored), and a reflex may interrupt it. However it ends, the arm is stopped firs
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -15,13 +16,15 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NotRequired, TypeAlias, TypedDict
 
+from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.live import LiveDetector, TimedDecision
+from sliplab.analysis.detectors.promise_watch import PromiseWatch
 from sliplab.analysis.networks import training
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
 from sliplab.flows.detecting.sources import NetworkSource
-from sliplab.flows.running import stopping
+from sliplab.flows.running import console, stopping
 from sliplab.flows.ui.detect_view import DetectView
 from sliplab.protocols import InputError
 from sliplab.protocols.hashing import hash_integer
@@ -155,7 +158,12 @@ def detect(
                 view.on_decision(timed)
 
         poll = (lambda: None) if view is None else view.poll
-        sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts)
+        watch = None if request.promise is None else PromiseWatch(request.promise)
+        say = functools.partial(_warn, view)
+        level = detector.set_by if isinstance(detector, AtLevel) else request.set_by
+        if level is not None and not level.promised:
+            say(level.words)
+        sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say)
         rig.connect()
         reaction, interrupted = None, False
         if request.trial is None:
@@ -163,6 +171,12 @@ def detect(
         else:
             reaction = _move(request, rig, sink)
     return _summary(request, sink, reaction, interrupted)
+
+
+def _warn(view: DetectView | None, text: str) -> None:
+    """Show a warning, if anything is shown."""
+    if view is not None:
+        console.say(f"warning: {text}")
 
 
 def _listen(request: DetectRequest, rig: Rig, sink: DetectSink) -> bool:

@@ -26,6 +26,7 @@ def run_evaluation(
     engine: str | None = None,
     predictions: Path | pd.DataFrame | None = None,
     dask: str | None = None,
+    promise: float | None = None,
 ) -> dict[str, Any]:
     """Score a network on the test trials.
 
@@ -35,17 +36,22 @@ def run_evaluation(
             share). smoothing: windows to average. By default the protocol's.
         reviewed: apply the decisions made in a review.
         baselines, checks: also train baselines; fail if permuted labels reveal a fault.
-        model, engine: a model file instead of the store's network, and what counts its spikes.
+        model, engine: a model file instead of the store's network, or a detector's calibration
+            (.json); what counts the network's spikes.
         predictions: of another program, instead; see `analysis.evaluation.predictions`.
         dask: the scheduler whose workers take the trials.
+        promise: false alarms an hour, at most, at which the store's detectors are compared, too.
 
     Returns:
-        the step's result; of `model` and `predictions` a `flows.judge_network.NetworkScores`.
+        the step's result; of `model` and `predictions` a `flows.judge_network.NetworkScores`, of a
+        detector's calibration a `flows.judge_detector.JudgedDetector`.
 
     Raises:
         InputError: arguments that exclude each other, or that are wrong.
         StoreError: a label or a network is missing or stale.
     """
+    from sliplab.analysis.detectors.skin import is_calibration
+
     made(RuleOptions, margin=margin, smoothing=smoothing)
     options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
     if model is None and engine is not None:
@@ -53,16 +59,23 @@ def run_evaluation(
     if model is not None and predictions is not None:
         raise InputError("--predictions", "", None, "cannot be given with --model")
     if model is not None or predictions is not None:
-        for name, chosen in (("--baselines", baselines), ("--checks", checks)):
+        alone = (("--baselines", baselines), ("--checks", checks), ("--promise", promise))
+        for name, chosen in alone:
             if chosen:
                 raise InputError(name, "", None, "applies only to the store's own network")
     if predictions is not None:
         options["predictions"] = predictions
         return {**run_step(folder, names, "judge_predictions", dask, **options)}
+    if model is not None and is_calibration(model):
+        of_networks = (("--margin", margin), ("--smoothing", smoothing), ("--engine", engine))
+        for name, given in of_networks:
+            if given is not None:
+                raise InputError(name, "", given, f"is of networks, and {model} is a detector")
+        return {**run_step(folder, names, "judge_detector", dask, model=model, reviewed=reviewed)}
     if model is not None:
         options |= {"model": model, "engine": engine}
         return {**run_step(folder, names, "judge_model", dask, **options)}
-    done: dict[str, Any] = {**run_step(folder, names, "evaluate", dask, **options)}
+    done: dict[str, Any] = {**run_step(folder, names, "evaluate", dask, promise=promise, **options)}
     for step, chosen in (("window_baselines", baselines), ("window_checks", checks)):
         if chosen:
             done[step] = run_step(folder, names, step, reviewed=reviewed)

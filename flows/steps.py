@@ -37,6 +37,7 @@ STEPS = {
     "train": "sliplab.flows.train",
     "evaluate": "sliplab.flows.evaluate",
     "judge_model": "sliplab.flows.judge_network",
+    "judge_detector": "sliplab.flows.judge_detector",
     "judge_predictions": "sliplab.flows.judge_network",
     "window_baselines": "sliplab.flows.window_checks",
     "window_checks": "sliplab.flows.window_checks",

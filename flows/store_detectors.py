@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.predictions import predict_trials
 from sliplab.analysis.detectors.registry import is_known, known
@@ -35,18 +36,29 @@ NETWORK = "network"
 
 @dataclass(frozen=True)
 class NetworkDetectors:
-    """A network with the detectors that read it, and the stride of the windows of each, ms."""
+    """A network with the detectors that read it, and the stride of the windows of each, ms.
+
+    Attributes:
+        promised: the levels of detectors by their names, where a promise set them.
+    """
 
     title: str
     model: ModelOnDisk
     detectors: Sequence[tuple[int, Tuned]]
+    promised: Mapping[str, Level] = field(default_factory=dict)
 
 
-def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[NetworkDetectors]:
+def store_detectors(
+    store: Store, campaigns: list[Collected], promise: float | None = None
+) -> Iterator[NetworkDetectors]:
     """Yield the store's own network with every detector, then the networks that `also` names.
 
     The first detector of each is its rule; the levels of the others are set by validation trials
     of the store.
+
+    Args:
+        promise: false alarms an hour, at most, that these levels promise; None: they leave a share
+            of the trials false early.
 
     Raises:
         StoreError: a network is missing or stale.
@@ -55,12 +67,19 @@ def store_detectors(store: Store, campaigns: list[Collected]) -> Iterator[Networ
     rules = rules_of(campaigns, settings.network.outputs_per_class)
     rule = rules[training_campaigns(campaigns)[0].name]
     detectors: list[tuple[int, Tuned]] = [(settings.stride_ms, paper_rule(rule))]
+    promised: dict[str, Level] = {}
     work = detector_work(StoreLabels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
         predict_trials(store, model.path, settings.windows, work.requests, keep)
-        detectors += [(settings.fine_stride_ms, it) for it in work.tune(store, settings, rule)]
-    yield NetworkDetectors(OWN, model, detectors)
+        if promise is None:
+            made = work.tune(store, settings, rule)
+        else:
+            rows = [row.found for row in work.promise(store, settings, rule, promise)]
+            made = [row.rule for row in rows]
+            promised = {row.rule.name: row.level for row in rows}
+        detectors += [(settings.fine_stride_ms, it) for it in made]
+    yield NetworkDetectors(OWN, model, detectors, promised)
     for other in _others(store, campaigns):
         theirs = other.settings
         with_rule = [(theirs.stride_ms, paper_rule(theirs.detection))]
@@ -83,15 +102,20 @@ class Chosen:
         model: None of a detector by its name.
         detector: None for the rule of the protocol that is run.
         stride_ms: from one window's start to the next one's; None for the window's length.
+        set_by: the promise that set the level of a tuned detector.
     """
 
     model: Path | None
     detector: Tuned | NamedSource | None = None
     stride_ms: int | None = None
+    set_by: Level | None = None
 
 
 def detectors_of(
-    place: Path | None, names: Sequence[str] = (), level: float | None = None
+    place: Path | None,
+    names: Sequence[str] = (),
+    level: float | None = None,
+    promise: float | None = None,
 ) -> dict[str, Chosen]:
     """Return detectors by their names: a model with the rule, or all that a store has.
 
@@ -100,6 +124,7 @@ def detectors_of(
         names: of the requested detectors, also such as `sliplab bench` judges; by default all of
             the model or store.
         level: of detectors by their names; None: the store's validation trials set it.
+        promise: false alarms an hour, at most, at which these set levels.
 
     Raises:
         InputError: there is none.
@@ -108,17 +133,17 @@ def detectors_of(
     store = place if place is not None and place.is_dir() else None
     found: dict[str, Chosen] = {}
     if place is not None:
-        found = {place.stem: Chosen(place)} if store is None else _of_store(store, names)
+        found = {place.stem: Chosen(place)} if store is None else _of_store(store, names, promise)
     for name in names:
         if name in found:
             continue
         if not is_known(name):
             raise InputError("--detector", "", name, one_of(name, [*found, *known()]))
-        found[name] = Chosen(None, named_source(name, level, store))
+        found[name] = Chosen(None, named_source(name, level, store, promise))
     return {name: found[name] for name in names or found}
 
 
-def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
+def _of_store(place: Path, names: Sequence[str], promise: float | None) -> dict[str, Chosen]:
     """Return the networks with their rules, and the tuned detectors, unless none is wanted."""
     if not any((place / "models").glob("*.pt")):
         if names and all(map(is_known, names)):
@@ -132,7 +157,8 @@ def _of_store(place: Path, names: Sequence[str]) -> dict[str, Chosen]:
         found[str(other.settings.preset)] = Chosen(other.path)
     if names and all(name in found or is_known(name) for name in names):
         return found
-    for network in store_detectors(store, campaigns):
+    for network in store_detectors(store, campaigns, promise):
         for stride_ms, tuned in network.detectors[1:]:  # the first one is the rule
-            found[tuned.name] = Chosen(network.model.path, tuned, stride_ms)
+            set_by = network.promised.get(tuned.name)
+            found[tuned.name] = Chosen(network.model.path, tuned, stride_ms, set_by)
     return found

@@ -262,6 +262,10 @@ class RigFile(StrictModel):
         """True if all data of this rig are simulated."""
         return "mock" in self.sections
 
+    def read_at_least(self, poll_s: float) -> RigFile:
+        """Return the rig with its streams read at least this often."""
+        return self.model_copy(update={"poll": min(self.poll, Decimal(str(poll_s)))})
+
     @property
     def in_virtual_time(self) -> bool:
         """True if the rig runs in virtual time, not in real time."""

@@ -12,6 +12,7 @@ from types import ModuleType
 MOVED = {
     "sliplab.rigs.testing": "sliplab.plugins.driver_kit",
     "sliplab.analysis.bench": "sliplab.plugins.bench",
+    "sliplab.plugins.bench.alarms": "sliplab.analysis.detectors.alarms",
     "sliplab.plugins.bench.interface": "sliplab.analysis.detectors.detector",
     "sliplab.plugins.bench.registry": "sliplab.analysis.detectors.registry",
     "sliplab.protocols.conditions": "sliplab.protocols.model",

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detector import (
     NOTHING_US,
     Detector,
@@ -29,10 +30,11 @@ class AtLevel(StreamDetector):
 
     Args:
         level: that the evidence must exceed.
+        set_by: the promise that set it; None where none did.
     """
 
-    def __init__(self, detector: Detector, level: float) -> None:
-        self.detector, self.level = detector, level
+    def __init__(self, detector: Detector, level: float, set_by: Level | None = None) -> None:
+        self.detector, self.level, self.set_by = detector, level, set_by
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`. Raises DetectorError."""

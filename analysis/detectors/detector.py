@@ -58,6 +58,8 @@ class Scene:
         width, height: the sensor's pixels.
         end_us: end of the recording.
         world: simulated rig that it shares with other scenes; empty if with none.
+        still_us: moment up to which surely nothing slips, where the slip is a label's; None: up to
+            the physical onset.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Scene:
     end_us: int
     slip: Slip
     world: str = ""
+    still_us: int | None = None
 
 
 @dataclass(frozen=True)

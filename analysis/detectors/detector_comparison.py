@@ -7,12 +7,19 @@ The numbers are small (a percent of 130 trials is one trial), so each rate has i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.detectors.alarms import (
+    Level,
+    SceneEvidence,
+    false_alarm_rate,
+    promised_levels,
+)
+from sliplab.analysis.detectors.detector import Evidence, Slip
 from sliplab.analysis.detectors.detectors import (
     DetectionRule,
     Learned,
@@ -35,11 +42,13 @@ from sliplab.analysis.detectors.onset_references import (
     Decided,
     References,
     judge_by_reference,
+    still_until_ns,
 )
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.detection import ComparisonSettings, Detection
 from sliplab.protocols.windows import Windows
 from sliplab.storage.schema.evaluation import (
+    AlarmRate,
     CurvePoint,
     DetectorComparison,
     DetectorLevels,
@@ -84,16 +93,17 @@ def set_levels(trials: Sequence[TrialEvidence], allowed: int, false_early_ns: in
     """
     if not 0 <= allowed < len(trials):
         raise ValueError(f"{allowed} of {len(trials)} trials may be false early: no bound")
+    highest = [
+        _highest(t.evidence.incipient, t.evidence, 0, t.slip.incipient_ns - false_early_ns)
+        for t in trials
+    ]
+    incipient = sorted(highest, reverse=True)[allowed]
+    return Levels(incipient, _gross_level(trials, incipient, allowed, false_early_ns))
 
-    def level(highest: list[float]) -> float:
-        return sorted(highest, reverse=True)[allowed]
 
-    incipient = level(
-        [
-            _highest(t.evidence.incipient, t.evidence, 0, t.slip.incipient_ns - false_early_ns)
-            for t in trials
-        ]
-    )
+def _gross_level(
+    trials: Sequence[TrialEvidence], incipient: float, allowed: int, false_early_ns: int
+) -> float:
     highest = []
     for t in trials:
         first = first_above(t.evidence.incipient, incipient)
@@ -102,13 +112,30 @@ def set_levels(trials: Sequence[TrialEvidence], allowed: int, false_early_ns: in
             continue
         gross = t.evidence.gross_after(first)
         highest.append(_highest(gross, t.evidence, first + 1, t.slip.gross_ns - false_early_ns))
-    return Levels(incipient, level(highest))
+    return sorted(highest, reverse=True)[allowed]
 
 
 def _highest(values: Any, evidence: WindowEvidence, start: int, before_ns: int) -> float:
     """The highest value of windows from `start` on that end before a moment; -inf without any."""
     stop = int(np.searchsorted(evidence.end_ns, before_ns, side="left"))
     return float(values[start:stop].max(initial=-np.inf))
+
+
+def scenes_of(trials: Sequence[TrialEvidence], false_early_ns: int) -> list[SceneEvidence]:
+    """Return trials as scenes that begin with their first window's end.
+
+    They are still until `still_until_ns`.
+    """
+    found = []
+    for trial in trials:
+        end_ns, slip = trial.evidence.end_ns, trial.slip
+        begin_ns = int(end_ns[0]) if len(end_ns) else slip.incipient_ns
+        still_ns = still_until_ns(slip, trial.references, false_early_ns)
+        still_us = max(still_ns - begin_ns, 0) // 1000
+        onset_us, gross_us = ((at - begin_ns) // 1000 for at in (slip.incipient_ns, slip.gross_ns))
+        evidence = Evidence.of((end_ns - begin_ns) // 1000, trial.evidence.incipient)
+        found.append(SceneEvidence(evidence, Slip(still_us, onset_us, gross_us)))
+    return found
 
 
 def outcomes(
@@ -195,6 +222,30 @@ def thinned(trial: TrialWithSlip, every: int) -> TrialWithSlip:
     return replace(trial, predictions=trial.predictions[::every])
 
 
+@dataclass(frozen=True)
+class PromisedRule:
+    """A rule whose incipient level validation trials set by a promise of false alarms.
+
+    Attributes:
+        choice: chosen smoothing, windows; 0 if there is nothing to choose.
+        level: of the incipient evidence.
+    """
+
+    rule: Tuned
+    choice: int
+    level: Level
+
+    def rate_on(self, trials: Sequence[TrialWithSlip], false_early_ns: int) -> AlarmRate:
+        """Return the rate of false alarms on trials; there are some."""
+        found = scenes_of(judge(self.rule.detector, trials), false_early_ns)
+        return false_alarm_rate(found, self.level.value)
+
+    def median_ms(self, trials: Sequence[TrialWithSlip], false_early_ns: int) -> float | None:
+        """Return the median latency of incipient slip, a missed one infinite; None if so."""
+        judged = judge(self.rule.detector, trials)
+        return _plain(merit(outcomes(judged, self.rule.levels, false_early_ns))[0])
+
+
 def tuned(
     parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int, rate: float
 ) -> list[Tuned]:
@@ -203,29 +254,63 @@ def tuned(
     Args:
         windows, settings, fine_ms, most: see `compare`. rate: share of the trials.
     """
-    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
     tolerance = round(settings.false_early_ms * 1e6)
     allowed = allowed_early(rate, len(parts.validation))
     found = []
-    for name, choices in _detectors(learned, windows, settings, fine_ms).items():
-        judged = {key: judge(detector, parts.validation) for key, detector in choices.items()}
-        key, levels = _quickest(judged, allowed, tolerance)
-        found.append(Tuned(name, choices[key], levels))
+    for name, choices, judged in _judged(parts, windows, settings, fine_ms, most):
+        levels = {key: set_levels(trials, allowed, tolerance) for key, trials in judged.items()}
+        key = _quickest(judged, levels, tolerance)
+        found.append(Tuned(name, choices[key], levels[key]))
     return found
 
 
+def promised(
+    parts: Parts,
+    windows: Windows,
+    settings: Detection,
+    fine_ms: int,
+    most: int,
+    rate: float,
+    promise: float,
+) -> list[PromisedRule]:
+    """Fit every detector at the finer stride, at a promise of false alarms.
+
+    The choice among several of a detector is made after their levels, by the same trials; each
+    level keeps its promise with 95 % alone.
+
+    Args:
+        windows, settings, fine_ms, most: see `compare`.
+        rate: share of the validation trials that may be false early for gross slip.
+        promise: false alarms an hour without slip, at most.
+    """
+    tolerance = round(settings.false_early_ms * 1e6)
+    allowed = allowed_early(rate, len(parts.validation))
+    found = []
+    for name, choices, judged in _judged(parts, windows, settings, fine_ms, most):
+        set_by, levels = {}, {}
+        for key, trials in judged.items():
+            (level,) = promised_levels(scenes_of(trials, tolerance), [promise])
+            gross = _gross_level(trials, level.value, allowed, tolerance)
+            set_by[key], levels[key] = level, Levels(level.value, gross)
+        key = _quickest(judged, levels, tolerance)
+        found.append(PromisedRule(Tuned(name, choices[key], levels[key]), key, set_by[key]))
+    return found
+
+
+def _judged(
+    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
+) -> Iterator[tuple[str, dict[int, DetectionRule], dict[int, list[TrialEvidence]]]]:
+    """Yield each detector's name, its choices, and their evidence on validation trials."""
+    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
+    for name, choices in _detectors(learned, windows, settings, fine_ms).items():
+        yield name, choices, {key: judge(it, parts.validation) for key, it in choices.items()}
+
+
 def _quickest(
-    judged: Mapping[int, Sequence[TrialEvidence]], allowed: int, tolerance: int
-) -> tuple[int, Levels]:
+    judged: Mapping[int, Sequence[TrialEvidence]], levels: Mapping[int, Levels], tolerance: int
+) -> int:
     """Of several choices of a detector the one that validation trials find quickest."""
-    ranked = []
-    for key, validation in judged.items():
-        levels = set_levels(validation, allowed, tolerance)
-        scored = outcomes(validation, levels, tolerance)
-        ranked.append((*merit(scored), key, levels))
-    # keys differ, so levels are never compared
-    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
-    return key, levels
+    return min(judged, key=lambda key: (*merit(outcomes(judged[key], levels[key], tolerance)), key))
 
 
 def _detectors(
@@ -289,7 +374,9 @@ def _best(
 ) -> _AtRate:
     """One detector at one rate."""
     validations = {key: validation for key, (validation, _) in judged.items()}
-    key, levels = _quickest(validations, allowed, tolerance)
+    every = {key: set_levels(found, allowed, tolerance) for key, found in validations.items()}
+    key = _quickest(validations, every, tolerance)
+    levels = every[key]
     of_validation, of_test = (
         _summary(trials, outcomes(trials, levels, tolerance), levels) for trials in judged[key]
     )

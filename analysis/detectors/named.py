@@ -11,12 +11,15 @@ from sliplab.analysis.detectors.stored_scenes import fitted_to
 from sliplab.storage.trials.store import Store
 
 
-def named_detector(name: str, level: float | None, store: Path | None) -> AtLevel:
+def named_detector(
+    name: str, level: float | None, store: Path | None, promise: float | None = None
+) -> AtLevel:
     """Return a detector.
 
     Args:
         level: that its evidence must exceed; None: validation trials of `store` set it.
         store: whose trials train it; None where it needs no training, and the level is given.
+        promise: false alarms an hour, at most, at which they set the level.
 
     Raises:
         InputError: there is none of the name.
@@ -28,7 +31,7 @@ def named_detector(name: str, level: float | None, store: Path | None) -> AtLeve
         if level is not None and not needs_training(made):
             return AtLevel(made, level)
         assert store is not None, "the request was checked"
-        fitted = fitted_to(Store(store), made)
+        fitted = fitted_to(Store(store), made, promise if level is None else None)
         return fitted if level is None else AtLevel(made, level)
     except BaseException:
         made.close()

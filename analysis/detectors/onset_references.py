@@ -105,6 +105,20 @@ def _interval(label: TrialLabel, slip: TrueSlip) -> tuple[int, int] | None:
     return None if first is None else (points.low_ns[first], points.high_ns[first])
 
 
+def still_until_ns(slip: TrueSlip, references: References, false_early_ns: int) -> int:
+    """Return the moment up to which surely nothing slipped: alarms before it are false.
+
+    It is the lower end of the change point's interval, since a tip slides before a marker has moved
+    by 2 pixels; at the latest the label's onset less the tolerance.
+    """
+    latest_ns = slip.incipient_ns - false_early_ns
+    point = references.get("change_point")
+    if point is None:
+        return latest_ns
+    low_ns = point.slip.incipient_ns if point.interval_ns is None else point.interval_ns[0]
+    return min(low_ns, latest_ns)
+
+
 def decisions_of(
     rows: Sequence[TrialScore],
     references: Mapping[tuple[str, str], References],

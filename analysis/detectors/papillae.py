@@ -3,7 +3,8 @@
 While the skin is loaded, the markers of all papillae move in the image, and their edges cause
 events. A tip that slides is loaded no further, so its marker comes to rest: the first sign of slip
 is that one place causes no more events while the others cause as many as before. Nothing is
-trained, and nothing is known of the sensor but its size.
+trained, and nothing is known of the sensor but its size and what `sliplab calibrate detector` finds
+of its skin (`PapillaeSettings`).
 
 Every millisecond:
 
@@ -24,12 +25,13 @@ Every millisecond:
    than before, the statistic is divided by `TOUCHED_SCALE` too.
 
 Evidence is the sum of the two largest statistics of all places from `LEAST` on, since tips let go
-one after the other; 0 below, and while fewer than `FEWEST_PLACES` of them move.
+one after the other; 0 below, and while fewer than `fewest_places` of them move.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +40,8 @@ from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
+VERSION = 1
+"""Incremented when the evidence of the same events is another."""
 BIN_US = 1000
 CELLS_ACROSS = 80
 """Cells along the image's width: a marker's edge has some ten of them."""
@@ -80,11 +84,35 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class PapillaeSettings:
+    """What is known of a skin.
+
+    Attributes:
+        size_px: width and height of the sensor; None: any.
+        hot: cells, row by row, whose events say nothing.
+        fewest_places: that move at once in a slide.
+    """
+
+    size_px: tuple[int, int] | None = None
+    hot: tuple[int, ...] = ()
+    fewest_places: int = FEWEST_PLACES
+
+
 class Papillae(Detector):
     """Detector by the silence of single papillae; see the module."""
 
+    def __init__(self, settings: PapillaeSettings | None = None) -> None:
+        self.settings = settings or PapillaeSettings()
+
     def begin(self, width: int, height: int) -> None:
-        """See `Detector`."""
+        """See `Detector`. Raises ValueError for a sensor of another size."""
+        size_px = self.settings.size_px
+        if size_px is not None and size_px != (width, height):
+            raise ValueError(
+                f"the sensor has {width} x {height} pixels; the skin was measured with "
+                f"{size_px[0]} x {size_px[1]}"
+            )
         self._cell_px = max(round(width / CELLS_ACROSS), 1)
         self._shape = -(-height // self._cell_px), -(-width // self._cell_px)
         self._done = 0
@@ -106,7 +134,7 @@ class Papillae(Detector):
             if at % PLACES_MS == 0:
                 self._find_places(at)
             end = min(at - at % PLACES_MS + PLACES_MS, last)
-            if len(self._rest) >= FEWEST_PLACES:
+            if len(self._rest) >= self.settings.fewest_places:
                 self._advance(at, value[at - first : end - first])
             else:
                 self._rest[:] = self._pushed[:] = 0.0
@@ -126,6 +154,26 @@ class Papillae(Detector):
         cells = CELLS_ACROSS**2 * 0.75
         return Cost(operations=20.0 * 30 + 4 * cells / PLACES_MS, memory_bytes=8 * 14)
 
+    @property
+    def columns(self) -> int:
+        """Cells of a row."""
+        return self._shape[1]
+
+    @property
+    def cell_px(self) -> int:
+        """Side of a cell."""
+        return self._cell_px
+
+    @property
+    def place_of_cells(self) -> I64:
+        """The present place of each cell, row by row; negative for none."""
+        return self._place
+
+    @property
+    def recent_events(self) -> I64:
+        """Events of each cell in the last quarter of a second."""
+        return np.bincount(self._cell, minlength=len(self._place))
+
     def _between(self, first: int, last: int) -> slice:
         """Return the events of the milliseconds from `first` on, before `last`."""
         return slice(*np.searchsorted(self._ms, (first, last)))
@@ -134,6 +182,8 @@ class Papillae(Detector):
         """Find the places at a millisecond; each takes over the statistics of its cells."""
         seen = self._cell[self._between(at - SEEN_MS, at)]
         events = np.bincount(seen, minlength=len(self._place))
+        if self.settings.hot:
+            events[list(self.settings.hot)] = 0
         found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
         self._place, self._rest, self._pushed, self._noise = found
 
@@ -145,7 +195,9 @@ class Papillae(Detector):
             self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise
         )
         scale = self._dispersion() ** 2
-        _advance(counts, self._noise, self._rest, self._pushed, self._touched, scale, value)
+        fewest = self.settings.fewest_places
+        rest, pushed = self._rest, self._pushed
+        _advance(counts, self._noise, rest, pushed, self._touched, scale, fewest, value)
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""
@@ -155,7 +207,8 @@ class Papillae(Detector):
     def _measure_dispersion(self, end: int) -> None:
         """Compare the shares of the places in the last 10 ms with those of the memory."""
         found = np.nan
-        if len(self._rest) >= FEWEST_PLACES:
+        fewest = self.settings.fewest_places
+        if len(self._rest) >= fewest:
             oldest = end - PLACES_MS - MEMORY_MS - GAP_MS
             part = self._between(oldest, end)
             counts = _counts(
@@ -164,7 +217,7 @@ class Papillae(Detector):
             n = counts[-PLACES_MS:].sum(axis=0)
             w = counts[PLACES_MS:-GAP_MS].sum(axis=0)
             n, w = n[w >= FEWEST_EVENTS], w[w >= FEWEST_EVENTS]
-            if len(w) >= FEWEST_PLACES and n.sum() > 0:
+            if len(w) >= fewest and n.sum() > 0:
                 expected = n.sum() * w / w.sum()
                 squares = np.sort((n - expected) ** 2 / expected)
                 found = squares[: len(w) - len(w) // 2].mean() / REMAINING_MEAN
@@ -251,7 +304,14 @@ def _counts(ms: I64, cell: I64, oldest: int, number: int, place: I64, noise: F64
 
 @njit(cache=True, nogil=True)
 def _advance(
-    counts: I64, noise: F64, rest: F64, pushed: F64, touched: I64, scale: float, value: F64
+    counts: I64,
+    noise: F64,
+    rest: F64,
+    pushed: F64,
+    touched: I64,
+    scale: float,
+    fewest: int,
+    value: F64,
 ) -> None:
     """Advance the statistics of the places, and write the evidence.
 
@@ -259,7 +319,7 @@ def _advance(
         counts: as of `_counts`. noise: events a millisecond of each place.
         rest, pushed: statistics, which are changed. scale: square of the dispersion.
         touched: milliseconds for which an object still counts as touching; changed, shape (1,).
-        value: of each millisecond.
+        fewest: places that must move. value: of each millisecond.
     """
     places = len(rest)
     memory = counts[: MEMORY_MS - 1].sum(axis=0)
@@ -268,7 +328,7 @@ def _advance(
         n = counts[k + MEMORY_MS + GAP_MS]
         moving = memory >= FEWEST_EVENTS
         others = moving & (rest < SUSPECTED) & (pushed < SUSPECTED)
-        if moving.sum() < FEWEST_PLACES or not others.any():
+        if moving.sum() < fewest or not others.any():
             rest[:] = 0.0
             pushed[:] = 0.0
         else:

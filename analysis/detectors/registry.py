@@ -4,6 +4,7 @@ A detector is named by
 
 - a name of `CORE`, that a plug-in declares, or of the entry point group `sliplab.detectors`;
 - ``module:attribute``, a class or function that takes no argument and returns a `Detector`;
+- the path of a JSON file that `sliplab calibrate detector` wrote;
 - the path of an ONNX file, or ``run:COMMAND``, a program that reads standard input and answers on
   output; the plug-in `bench` runs both.
 """
@@ -20,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from sliplab.analysis.detectors.detector import Detector
+from sliplab.analysis.detectors.skin import SUFFIX, calibrated, load_calibration
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, foreign_code
@@ -39,14 +41,14 @@ def known() -> dict[str, str]:
 
 def is_known(name: str) -> bool:
     """Return whether a name has the form of a detector's, or is one."""
-    return ":" in name or name.endswith(ONNX) or name in known()
+    return ":" in name or name.endswith((ONNX, SUFFIX)) or name in known()
 
 
 def contents(name: str) -> list[str]:
     """Return hashes of the files that a detector's name names: its module, model or program."""
     if name.startswith(PROGRAM):
         files = [Path(word) for word in shlex.split(name.removeprefix(PROGRAM))]
-    elif name.endswith(ONNX):
+    elif name.endswith((ONNX, SUFFIX)):
         files = [Path(name)]
     else:
         module = known().get(name, name).partition(":")[0]
@@ -64,6 +66,8 @@ def make_detector(name: str) -> Detector:
     if name.startswith(PROGRAM) or name.endswith(ONNX):
         made: Detector = plugins().hook("foreign_detector")(name)
         return made
+    if name.endswith(SUFFIX):
+        return calibrated(load_calibration(Path(name)))
     names = known()
     if name not in names and ":" not in name:
         hint = did_you_mean(name, names)
@@ -71,7 +75,8 @@ def make_detector(name: str) -> Detector:
             _KEY,
             "",
             name,
-            f"must be one of {', '.join(names)}, MODULE:ATTRIBUTE, a file that ends in {ONNX}, or "
+            f"must be one of {', '.join(names)}, MODULE:ATTRIBUTE, a file that ends in {ONNX} or "
+            f"{SUFFIX}, or "
             f"{PROGRAM}COMMAND{hint}",
         )
     return _imported(name, names.get(name, name))

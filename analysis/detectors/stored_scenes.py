@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.detectors.alarms import SceneEvidence, promised_levels
 from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
-from sliplab.analysis.detectors.detector_comparison import TrialEvidence, allowed_early, set_levels
+from sliplab.analysis.detectors.detector_comparison import (
+    TrialEvidence,
+    allowed_early,
+    set_levels,
+)
 from sliplab.analysis.detectors.detectors import WindowEvidence
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
+from sliplab.analysis.detectors.onset_references import references_of, still_until_ns
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.detection import ComparisonSettings
@@ -22,11 +29,14 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
 
-def fitted_to(store: Store, detector: Detector) -> AtLevel:
+def fitted_to(store: Store, detector: Detector, promise: float | None = None) -> AtLevel:
     """Return a detector that the store's training trials trained, at the level of its validation.
 
     The level is that of the detector comparison: the lowest at which at most the middle one of
-    `compare.rates` of the validation trials are false early.
+    `compare.rates` of the validation trials are false early, or that which promises a rate.
+
+    Args:
+        promise: false alarms an hour without slip, at most.
 
     Raises:
         StoreError: no training or validation trial has both onsets, or one has no events.
@@ -38,9 +48,14 @@ def fitted_to(store: Store, detector: Detector) -> AtLevel:
     train = scenes(labels, campaigns, "train", asked.train_trials)
     validation = scenes(labels, campaigns, "validation")
     detector.train(train, validation)
+    if promise is not None:
+        found = [judged_scene(it, feed(detector, it)) for it in validation]
+        (level,) = promised_levels(found, [promise])
+        return AtLevel(detector, level.value, level)
     judged = [TrialEvidence(_windows(feed(detector, it)), _slip(it)) for it in validation]
+    tolerance = round(rule.false_early_ms * 1e6)
     rate = asked.rates[len(asked.rates) // 2]
-    levels = set_levels(judged, allowed_early(rate, len(judged)), round(rule.false_early_ms * 1e6))
+    levels = set_levels(judged, allowed_early(rate, len(judged)), tolerance)
     return AtLevel(detector, levels.incipient)
 
 
@@ -52,19 +67,41 @@ def scenes(
     Raises:
         StoreError: there is none, or one has no events.
     """
-    found: list[Scene] = []
-    for item in campaigns:
-        for _, recording in item.of_split(split):
-            slip = true_slip(labels.read(item, recording))
-            if slip is not None and (most is None or len(found) < most):
-                found.append(scene(recording, f"{item.name}/{recording.folder.name}", slip))
+    found = list(islice(each_scene(labels, campaigns, split), most))
     if not found:
         raise StoreError(f"{labels.store.folder}: no {split} trial has both onsets")
     return found
 
 
-def scene(recording: Recording, name: str, slip: TrueSlip) -> Scene:
+def each_scene(labels: StoreLabels, campaigns: Sequence[Collected], split: str) -> Iterator[Scene]:
+    """Yield the trials of a part of the split that have both onsets, one at a time.
+
+    Raises:
+        StoreError: one has no events.
+    """
+    for item in campaigns:
+        for _, recording in item.of_split(split):
+            label = labels.read(item, recording)
+            slip = true_slip(label)
+            if slip is None:
+                continue
+            early_ns = round(item.settings.detection.false_early_ms * 1e6)
+            still_ns = still_until_ns(slip, references_of(recording, label), early_ns)
+            yield scene(recording, f"{item.name}/{recording.folder.name}", slip, still_ns)
+
+
+def judged_scene(given: Scene, evidence: Evidence) -> SceneEvidence:
+    """Return evidence on a stored trial, in which nothing slips up to `still_us`."""
+    slip = given.slip
+    still_us = slip.physical_us if given.still_us is None else given.still_us
+    return SceneEvidence(evidence, replace(slip, physical_us=still_us))
+
+
+def scene(recording: Recording, name: str, slip: TrueSlip, still_ns: int | None = None) -> Scene:
     """Return a trial's events from the start of its recording, with the slip that its label gives.
+
+    Args:
+        still_ns: moment up to which surely nothing slips.
 
     Raises:
         StoreError: it has no events.
@@ -86,6 +123,7 @@ def scene(recording: Recording, name: str, slip: TrueSlip) -> Scene:
         *recording.event_px,
         us(span_ns[1]) - begin_us,
         Slip(incipient_us, incipient_us, us(slip.gross_ns) - begin_us),
+        still_us=None if still_ns is None else max(us(still_ns) - begin_us, 0),
     )
 
 

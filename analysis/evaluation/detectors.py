@@ -6,7 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.detectors.detector_comparison import Parts, compare, tuned
+from sliplab.analysis.detectors.detector_comparison import (
+    Parts,
+    PromisedRule,
+    compare,
+    promised,
+    tuned,
+)
 from sliplab.analysis.detectors.detectors import Predictions, TrialWithSlip, Tuned
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.onset_references import References, references_of
@@ -19,7 +25,8 @@ from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.storage.schema.evaluation import DetectorComparison, RuleChoice
+from sliplab.protocols.windows import Windows
+from sliplab.storage.schema.evaluation import AlarmRate, DetectorComparison, RuleChoice
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -32,6 +39,20 @@ class KnownTrial:
     label: str
     slip: TrueSlip
     references: References
+
+
+@dataclass(frozen=True)
+class PromisedRow:
+    """A detector at the level that a promise set, with its test figures.
+
+    Attributes:
+        test: false alarms on test trials; None without any.
+        median_ms: incipient latency on them, a missed one infinite; None if so.
+    """
+
+    found: PromisedRule
+    test: AlarmRate | None
+    median_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -99,14 +120,42 @@ class DetectorWork:
         Args:
             settings: windows and strides; detection: the paper's rule.
         """
+        tuning = self._tuning(store, settings, detection)
+        return [] if tuning is None else tuned(*tuning)
+
+    def promise(
+        self, store: Store, settings: AnalysisSettings, detection: Detection, rate: float
+    ) -> list[PromisedRow]:
+        """Return the same detectors at the levels that promise a rate, with their test figures.
+
+        Args:
+            settings, detection: as `tune`.
+            rate: false alarms an hour without slip, at most.
+        """
+        tuning = self._tuning(store, settings, detection)
+        if tuning is None:
+            return []
+        tolerance, test = round(detection.false_early_ms * 1e6), tuning[0].test
+        return [
+            PromisedRow(
+                found,
+                found.rate_on(test, tolerance) if test else None,
+                found.median_ms(test, tolerance),
+            )
+            for found in promised(*tuning, rate)
+        ]
+
+    def _tuning(
+        self, store: Store, settings: AnalysisSettings, detection: Detection
+    ) -> tuple[Parts, Windows, Detection, int, int, float] | None:
         fine, asked = settings.fine_stride_ms, detection.compare
         parts = _parts(store, self.compared)
         if parts is None or fine is None or asked is None:
-            return []
+            return None
         if not (parts.train and parts.validation):
-            return []
+            return None
         rate = asked.rates[len(asked.rates) // 2]
-        return tuned(parts, settings.windows, detection, fine, settings.most_spikes, rate)
+        return parts, settings.windows, detection, fine, settings.most_spikes, rate
 
     def compare(
         self, store: Store, settings: AnalysisSettings, detection: Detection

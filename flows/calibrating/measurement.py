@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
+from typing import TypeVar
 
 import typer
 
@@ -21,7 +22,11 @@ from sliplab.rigs.rig_edit import writable_target, write_entries
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path
 from sliplab.rigs.rig_lock import held
+from sliplab.storage.files import write_json
+from sliplab.storage.schema.document import Document
 
+T = TypeVar("T")
+D = TypeVar("D", bound=Document)
 ANNOUNCEMENT = (
     f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "
     f"{APPROACH_MM_S:g} mm/s, and then as listed"
@@ -89,15 +94,22 @@ class Measurement:
 
     Args:
         out: the file to write; None for the rig file itself.
-        what: name of the measurement: ``plane``, ``zero``, ``tool``, ``lens`` or ``crop``.
+        what: name of the measurement: ``plane``, ``zero``, ``tool``, ``lens``, ``crop`` or
+            ``detector``.
+
+        poll_s: longest period of reading the streams; None: the rig's.
 
     Raises:
         InputError: the rig file cannot be read, or not be written to.
     """
 
-    def __init__(self, rig: Path, out: Path | None, what: str, as_json: bool) -> None:
+    def __init__(
+        self, rig: Path, out: Path | None, what: str, as_json: bool, poll_s: float | None = None
+    ) -> None:
         self.path, self.what, self.as_json = rig_path(rig), what, as_json
         self.file, self.text = load_rig_file(rig)
+        if poll_s is not None:
+            self.file = self.file.read_at_least(poll_s)
         self._target: Callable[[], Path] = lambda: writable_target(self.path, out)
 
     def run(
@@ -127,21 +139,7 @@ class Measurement:
             self._print_moves(moves, who)
             return
         target = self._target()
-        self._announce(moves, who)
-        if moves and not yes:
-            _confirm()
-        today = date.today()
-        with held(self.file):
-            rig = build.build_rig(self.file, stopping.requested)
-            try:
-                if with_arm:
-                    rig.connect()
-                finding = measure(CalibrationSession(self.file, rig, today))
-            except StopRequested:
-                console.say("stopped: the arm is at rest, nothing was written")
-                raise KeyboardInterrupt from None
-            finally:
-                rig.close()
+        finding, today = self.measured(moves, yes, measure, who, with_arm=with_arm)
         written = write_entries(
             self.path,
             target,
@@ -152,10 +150,56 @@ class Measurement:
         )
         self._report(finding, written.path, written.retained)
 
+    def write_document(
+        self,
+        target: Path,
+        moves: Sequence[PlannedMove],
+        yes: bool,
+        dry_run: bool,
+        measure: Callable[[CalibrationSession], D],
+    ) -> D | None:
+        """Run a measurement whose result is a document beside the rig file, as `run`.
+
+        Returns:
+            the document, which was written to `target`; None in a dry run.
+        """
+        if dry_run:
+            self._print_moves(moves, "")
+            return None
+        made, _ = self.measured(moves, yes, measure)
+        write_json(target, made.to_json())
+        return made
+
+    def measured(
+        self,
+        moves: Sequence[PlannedMove],
+        yes: bool,
+        measure: Callable[[CalibrationSession], T],
+        who: str = "",
+        *,
+        with_arm: bool = True,
+    ) -> tuple[T, date]:
+        """Announce, ask, and measure; return the result and the day. For the rest see `run`."""
+        self._announce(moves, who)
+        if moves and not yes:
+            _confirm()
+        today = date.today()
+        with held(self.file):
+            rig = build.build_rig(self.file, stopping.requested)
+            try:
+                if with_arm:
+                    rig.connect()
+                return measure(CalibrationSession(self.file, rig, today)), today
+            except StopRequested:
+                console.say("stopped: the arm is at rest, nothing was written")
+                raise KeyboardInterrupt from None
+            finally:
+                rig.close()
+
     def _rows(self, moves: Sequence[PlannedMove]) -> list[AnnouncedMove]:
         plane = self.file.calibration.contact_plane
         frame = PlateFrame.taught((plane.centre, plane.right, plane.above))
-        if self.what == "crop":
+        if self.what in ("crop", "detector"):
             frame = frame.with_zero(self.file.calibration.zero_mm)
         rows = []
         for move in moves:

@@ -45,6 +45,15 @@ EnableOption = Annotated[
     list[str] | None,
     typer.Option("--enable", help="Enable an optional level: factor=level. Repeatable."),
 ]
+PromiseOption = Annotated[
+    float | None,
+    typer.Option(
+        "--promise",
+        min=0.001,
+        max=1e6,
+        help="Set levels so that false alarms an hour without slip are at most this, 95 % sure.",
+    ),
+]
 CampaignOption = Annotated[
     list[str] | None, typer.Option("--campaign", help="Only this campaign. Repeatable.")
 ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, RigOption
+from sliplab.flows.cli.common import ANALYSE, EnableOption, JsonOption, PromiseOption, RigOption
 from sliplab.flows.cli.model_options import model_options
 from sliplab.flows.planning.parameters import RuleOptions
 from sliplab.flows.running import console, exit_codes
@@ -31,7 +31,11 @@ def detect(
     rig: RigOption,
     model: Annotated[
         Path | None,
-        typer.Option("--model", help="A trained network, models/seed0.pt, or a store with one."),
+        typer.Option(
+            "--model",
+            help="A trained network, models/seed0.pt, a store with one, or a .json of `sliplab "
+            "calibrate detector`.",
+        ),
     ] = None,
     detector: Annotated[
         str,
@@ -51,6 +55,7 @@ def detect(
             "the store's validation trials.",
         ),
     ] = None,
+    promise: PromiseOption = None,
     protocol: Annotated[
         Path | None,
         typer.Option("--protocol", help="Run a trial of this protocol; default: only listen."),
@@ -99,7 +104,7 @@ def detect(
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detecting.request import make_detect_request
 
-    chosen = _chosen(model, detector, level, stride, rule)
+    chosen = _chosen(model, detector, level, stride, rule, promise)
     order = make_detect_request(
         rig,
         chosen.model,
@@ -113,6 +118,8 @@ def detect(
         **rule.model_dump(),
         poll_s=poll / 1000,
         detector=chosen.detector,
+        promise=promise,
+        set_by=chosen.set_by,
     )
     result = run(order, out)
     if as_json:
@@ -130,6 +137,7 @@ def _chosen(
     level: float | None,
     stride: float | None,
     rule: RuleOptions,
+    promise: float | None,
 ) -> Chosen:
     """Return a network with the rule, a detector of a store, or one by its name.
 
@@ -137,6 +145,11 @@ def _chosen(
         InputError: there is no such detector, or it has no such option.
         StoreError: a network of the store is missing or stale.
     """
+    if model is not None and model.suffix == ".json":
+        if detector != "network":
+            right = f"cannot be given with {model}, which is a detector"
+            raise InputError("--detector", "", detector, right)
+        model, detector = None, str(model)
     store = model if model is not None and model.is_dir() else None
     if store is not None:
         from sliplab.flows.steps import prepare_store
@@ -156,7 +169,7 @@ def _chosen(
             raise InputError("--detector", "", detector, right)
         found = Chosen(model)
     else:
-        found = detectors_of(store, [detector], level)[detector]
+        found = detectors_of(store, [detector], level, promise)[detector]
     if level is not None and found.model is not None:
         right = f"is of detectors of `sliplab bench`; '{detector}' has its own"
         raise InputError("--level", "", level, right)
@@ -183,6 +196,8 @@ def _shown(result: DetectSummary) -> dict[str, str | None]:
     for name, onset in result["onsets"].items():
         where = "" if onset is None or not onset["phase"] else f" ({onset['phase']})"
         found[f"first {name}"] = None if onset is None else f"{onset['trial_s']:.3f} s{where}"
+    if result["promise"] is not None:
+        found["promise"] = result["promise"]["says"]
     if result["reflex"] is not None:
         reflex = result["reflex"]
         done = f"{reflex['kind']}: not called for"

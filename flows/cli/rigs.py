@@ -409,6 +409,57 @@ def calibrate_crop(
     command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
 
 
+@calibrate_app.command("detector", epilog="Example: sliplab calibrate detector --rig my-rig.yaml")
+def calibrate_detector(
+    rig: RigOption,
+    depth: Annotated[
+        float, typer.Option("--depth", min=0.2, max=20, help="Press depth, mm.")
+    ] = 2.4,
+    hold: Annotated[
+        float,
+        typer.Option(
+            "--hold", min=5, max=36_000, help="Time pressed and still, s: more promises more."
+        ),
+    ] = 30.0,
+    rub: Annotated[
+        float, typer.Option("--rub", min=0.5, max=20, help="Length of a rub, mm.")
+    ] = 3.0,
+    speed: Annotated[
+        float, typer.Option("--speed", min=0.1, max=20, help="Speed of the rubs, mm/s.")
+    ] = 1.0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="File to write (.json); default: RIG.detector.json."),
+    ] = None,
+    yes: YesOption = False,
+    dry_run: DryOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Set up the detector by papillae for a skin: a hold, an unload and three short rubs."""
+    from sliplab.flows.calibrating import detector as steps
+    from sliplab.flows.calibrating.measurement import Measurement
+
+    command = Measurement(rig, None, "detector", as_json, poll_s=steps.POLL_S)
+    motion = steps.SkinMotion(depth, hold, rub, speed)
+    motion.check(command.file)
+    target = steps.document_target(command.file, out)
+    made = command.write_document(
+        target,
+        motion.moves,
+        yes,
+        dry_run,
+        lambda session: steps.calibrate_detector(session, motion),
+    )
+    if made is None:
+        return
+    if as_json:
+        console.print_json({**made.to_json(), "written": str(target)})
+        return
+    simulated = " (simulated)" if made.simulated else ""
+    console.print_pairs(f"detector of rig {made.rig}{simulated}", steps.shown(made))
+    console.say(f"written to {target}; use it as `sliplab detect --model {target.name}`")
+
+
 @calibrate_app.command("board", epilog="Example: sliplab calibrate board --out board.pdf")
 @model_options
 def calibrate_board(

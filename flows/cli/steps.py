@@ -14,6 +14,7 @@ from sliplab.flows.cli.common import (
     DaskOption,
     JsonOption,
     PlaceArgument,
+    PromiseOption,
     finish,
     step,
 )
@@ -25,8 +26,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
+    from sliplab.flows.evaluate import PromisedDetector
+    from sliplab.flows.judge_detector import JudgedDetector
     from sliplab.flows.judge_network import NetworkScores
     from sliplab.flows.sync import SyncDone
+    from sliplab.storage.streams import Json
 
 app = typer.Typer()
 
@@ -108,8 +112,8 @@ def evaluate(
         Path | None,
         typer.Option(
             "--model",
-            help="Score this model instead of the store's: a model file or a Sinabs state_dict "
-            "with its description.",
+            help="Score this model instead of the store's: a model file, a Sinabs state_dict "
+            "with its description, or a .json of `sliplab calibrate detector`.",
         ),
     ] = None,
     engine: Annotated[
@@ -126,6 +130,7 @@ def evaluate(
             "table (docs/models.md).",
         ),
     ] = None,
+    promise: PromiseOption = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -144,13 +149,60 @@ def evaluate(
         engine=None if engine is None else engine.value,
         predictions=predictions,
         dask=dask,
+        promise=promise,
     )
+    if promise is not None and not as_json:
+        _show_promises(done.pop("promise"), f"detectors at the promise, {store}")
     if as_json or (model is None and predictions is None):
         finish(done, f"evaluate {store}", as_json)
+        return
+    if "detector" in done:
+        _show_detector(cast("JudgedDetector", done), store)
         return
     scores = cast("NetworkScores", done)
     simulated = " (simulated)" if scores["simulated"] else ""
     console.print_pairs(f"{scores['model']} on {store}{simulated}", _model_scores(scores))
+
+
+def _show_promises(rows: list[PromisedDetector], title: str) -> None:
+    """Print detectors at the levels that a promise set."""
+    from sliplab.analysis.report.page import number
+
+    def rate(found: Json | None) -> str:
+        return "" if found is None else f"{found['alarms']} in {found['hours']:.3g} h"
+
+    columns = ["detector", "level", "validation alarms", "test alarms", "median, ms", "promise"]
+    table = [
+        [
+            row["detector"],
+            number(row["level"], 2),
+            rate(row["validation"]),
+            rate(row["test"]),
+            number(row["median_ms"], 0),
+            "kept" if row["promised"] else "none",
+        ]
+        for row in rows
+    ]
+    console.print_table(title, columns, table)
+    for says in dict.fromkeys(row["says"] for row in rows if not row["promised"]):
+        console.say(says)
+
+
+def _show_detector(found: JudgedDetector, store: str) -> None:
+    """Print the figures of a calibrated detector."""
+    from sliplab.analysis.report.alarms import rate_words
+    from sliplab.analysis.report.page import number
+
+    alarms = found["false_alarms"]
+    shown = {
+        "level": number(found["level"], 2),
+        "incipient latency": f"median {number(found['median_ms'], 0)} ms of {found['trials']}; "
+        f"{found['missed']} missed, {found['early']} of them false early",
+        "false alarms an hour": f"{rate_words(alarms)} in {alarms.hours:.3g} h",
+        "promised of holding": f"at most {number(found['promised'], 1)} an hour",
+    }
+    simulated = " (simulated)" if found["simulated"] else ""
+    console.print_pairs(f"{found['detector']} on {store}{simulated}", shown)
 
 
 def _model_scores(result: NetworkScores) -> dict[str, str | int]:

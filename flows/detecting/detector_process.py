@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
 from sliplab.storage.streams import EventChunk
@@ -68,21 +69,30 @@ class DetectorProcess(Detector):
     """A detector by its name in a separate process, which trains it.
 
     Args:
-        name, level, store: as `flows.detecting.sources.NamedSource`.
+        name, level, store, promise: as `flows.detecting.sources.NamedSource`.
         answer_s: timeout of an answer after the first one, for which kernels may be compiled.
 
     Raises:
         DetectorError: it does not start.
     """
 
-    def __init__(self, name: str, level: float | None, store: Path | None, answer_s: float) -> None:
+    def __init__(
+        self,
+        name: str,
+        level: float | None,
+        store: Path | None,
+        promise: float | None = None,
+        *,
+        answer_s: float,
+    ) -> None:
         self._answer_s, self._warm = answer_s, False
-        arguments = name, level, None if store is None else str(store)
+        arguments = name, level, None if store is None else str(store), promise
         with _as_detector_error():
             self._process = LibraryProcess(
                 "detector's process", f"{__name__}:serve_detector", arguments, TRAIN_S
             )
             self.level: float = self._process.call("level", within_s=PATIENT_S)
+            self.set_by: Level | None = self._process.call("set_by", within_s=PATIENT_S)
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`. Raises DetectorError."""
@@ -110,7 +120,9 @@ def _as_detector_error() -> Iterator[None]:
         raise DetectorError(str(error)) from error
 
 
-def serve_detector(fd: int, name: str, level: float | None, store: str | None) -> None:
+def serve_detector(
+    fd: int, name: str, level: float | None, store: str | None, promise: float | None
+) -> None:
     """Run the process: train the detector, then answer calls from the pipe on `fd`."""
     pipe = Connection(fd)
     with suppress(EOFError, OSError):
@@ -120,7 +132,7 @@ def serve_detector(fd: int, name: str, level: float | None, store: str | None) -
             from sliplab.analysis.networks import training
 
             training.limit_threads(1)
-            made = named_detector(name, level, None if store is None else Path(store))
+            made = named_detector(name, level, None if store is None else Path(store), promise)
         except Exception as error:
             pipe.send((False, str(error)))
             os._exit(1)
@@ -128,6 +140,7 @@ def serve_detector(fd: int, name: str, level: float | None, store: str | None) -
         detector = made.detector
         calls: dict[str, Callable[..., Any]] = {
             "level": lambda: made.level,
+            "set_by": lambda: made.set_by,
             "begin": detector.begin,
             "push": detector.push,
         }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
@@ -41,6 +41,8 @@ class DetectRequest:
         safe: reaction when slip can no longer be detected, where a reflex is requested.
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until the user ends it.
+        promise: false alarms an hour, at most, that are watched; None without a promise.
+        set_by: the promise that set a tuned detector's level.
     """
 
     rig: RigFile
@@ -50,6 +52,8 @@ class DetectRequest:
     reflex: Reflex | None = None
     safe: Reflex | None = None
     seconds: float | None = None
+    promise: float | None = None
+    set_by: Level | None = None
 
     @property
     def answer_s(self) -> float | None:
@@ -94,12 +98,15 @@ def make_detect_request(
     smoothing: int | None = None,
     poll_s: float = POLL_S,
     detector: Tuned | NamedSource | None = None,
+    promise: float | None = None,
+    set_by: Level | None = None,
 ) -> DetectRequest:
     """Read and check everything that can be known before anything moves.
 
     Args:
         model: a network; None where `detector` is another one.
         detector: instead of the network with the protocol's rule, or instead of the rule.
+        promise, set_by: as `DetectRequest`. By default a calibrated detector's own promise.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
@@ -109,7 +116,10 @@ def make_detect_request(
     change = {name: value for name, value in given if value is not None}
     source: Callable[[AnalysisSettings | None], Source]
     if isinstance(detector, NamedSource):
+        detector.check_rig(file)
         source = partial(_named, detector)
+        if promise is None and detector.skin is not None:
+            promise = detector.skin.hold.high
     else:
         assert model is not None
         source = _network(model, stride_ms, detector, change)
@@ -122,9 +132,11 @@ def make_detect_request(
             right = f"is needed on {file.name}: its time is virtual and has no end"
             raise InputError("--seconds", "", None, right)
         return DetectRequest(
-            rig=_read_often(file, poll_s),
+            rig=file.read_at_least(poll_s),
             source=source(None),
             seconds=seconds,
+            promise=promise,
+            set_by=set_by,
         )
     if seconds is not None:
         right = "applies only without --protocol; a trial lasts as long as its motion"
@@ -135,18 +147,15 @@ def make_detect_request(
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     chosen = choose_trial(plan, trial)
     return DetectRequest(
-        rig=_read_often(with_level(file, plan) if file.simulated else file, poll_s),
+        rig=(with_level(file, plan) if file.simulated else file).read_at_least(poll_s),
         source=source(plan.protocol.analysis),
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
         safe=None if reflex is None else make_safe_state(file, plan),
+        promise=promise,
+        set_by=set_by,
     )
-
-
-def _read_often(file: RigFile, poll_s: float) -> RigFile:
-    """Return a rig that reads its streams at least this often."""
-    return file.model_copy(update={"poll": min(file.poll, Decimal(str(poll_s)))})
 
 
 def _named(source: NamedSource, stated: AnalysisSettings | None) -> Source:

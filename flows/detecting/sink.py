@@ -25,6 +25,7 @@ from sliplab.analysis.detectors.live import (
     LiveDetector,
     TimedDecision,
 )
+from sliplab.analysis.detectors.promise_watch import PromiseWatch
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
 from sliplab.flows.detecting.detector_process import NetworkLost
 from sliplab.rigs.core.capabilities import Clock
@@ -34,6 +35,8 @@ from sliplab.storage.streams import EVENTS_KIND, Chunk, EventChunk, NullSink, Pu
 PATIENCE_US = 200_000
 """Wait before evaluating a window that no event follows, us on the camera's clock as estimated
 here: events that were sent earlier must have arrived by then."""
+HOLD = "hold"
+"""Phase in which nothing slips, before the motion."""
 KEPT = 100_000
 """Latencies stored for the summary: the last 55 minutes of 30 ms windows."""
 
@@ -74,6 +77,25 @@ class Times(TypedDict):
     n: int
 
 
+class PromiseJson(TypedDict):
+    """What became of a promise of false alarms.
+
+    Attributes:
+        per_hour: promised, at most.
+        alarms, hours: counted while nothing slipped, as far as was declared.
+        declared: a protocol's holds before its motion; else the whole time, in which something may
+            have slipped.
+        broken_h: counted time at which the alarms contradicted the promise; None if they do not.
+    """
+
+    per_hour: float
+    alarms: int
+    hours: float
+    declared: bool
+    broken_h: float | None
+    says: str
+
+
 class DetectNumbers(TypedDict):
     """Numbers of a detector's windows and of their times.
 
@@ -84,6 +106,7 @@ class DetectNumbers(TypedDict):
         latency_ms: from a window's last event to its decision.
         compute_ms: from the read of the events to the decision.
         losses: as `analysis.detectors.live.Losses`.
+        promise: what became of the promise of false alarms; None without one.
     """
 
     events: int
@@ -94,6 +117,7 @@ class DetectNumbers(TypedDict):
     latency_ms: Times
     compute_ms: Times
     losses: dict[str, int]
+    promise: PromiseJson | None
 
 
 class DetectSink(NullSink):
@@ -104,6 +128,8 @@ class DetectSink(NullSink):
         on_decision: called with each decision as soon as it is made.
         every_poll: called each time that the streams were read.
         timeouts: beyond which slip cannot be detected in time; None: never reported.
+        watch: of the promise of false alarms; None without one.
+        on_broken: called once with a text, when the alarms contradict that promise.
     """
 
     def __init__(
@@ -113,8 +139,12 @@ class DetectSink(NullSink):
         on_decision: Callable[[TimedDecision], None],
         every_poll: Callable[[], None] = lambda: None,
         timeouts: Timeouts | None = None,
+        watch: PromiseWatch | None = None,
+        on_broken: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.detector, self.phase = detector, ""
+        self._watch, self._on_broken = watch, on_broken
+        self._declared = self._held = self._moved = False
         self.armed = self.guarded = False
         self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
         self._timeouts = timeouts
@@ -129,7 +159,9 @@ class DetectSink(NullSink):
 
     def step(self, phase: str, acting: bool) -> None:
         """Note that a step of the motion begins."""
-        self.phase = phase
+        self.phase, self._declared = phase, True
+        self._held = self._held or phase == HOLD
+        self._moved = self._held and (self._moved or phase != HOLD)
 
     def add(self, device: str, chunk: Chunk) -> None:
         """Feed the event camera's stream to the detector.
@@ -230,6 +262,7 @@ class DetectSink(NullSink):
                 decision, (decision.end_us - origin_us) / 1e6, self.phase, latency_ms, compute_ms
             )
             self._states[timed.state] += 1
+            self._keep_promise(decision)
             if decision.onset is not None:
                 self.onsets[decision.onset] = timed.as_json()
             if slip is None and decision.valid_class == INCIPIENT:
@@ -238,6 +271,34 @@ class DetectSink(NullSink):
         if slip is not None and self.armed:
             self.armed = False
             raise SlipDetected(slip)
+
+    def _keep_promise(self, decision: LiveDecision) -> None:
+        """Count a decision for the promise, if nothing slips: in holds before the motion.
+
+        Without a motion nothing is declared, and all of the time counts.
+        """
+        watch = self._watch
+        if watch is None or (self._declared and (self._moved or not self._held)):
+            return
+        before = watch.broken_h
+        watch.add(decision.start_us, decision.end_us, decision.valid_class >= INCIPIENT)
+        if before is None and watch.broken_h is not None:
+            self._on_broken(self._promise_words(watch))
+
+    def _promise_words(self, watch: PromiseWatch) -> str:
+        return watch.words + ("" if self._declared else ", unless something slipped")
+
+    def _promise(self) -> PromiseJson | None:
+        if (watch := self._watch) is None:
+            return None
+        return {
+            "per_hour": watch.per_hour,
+            "alarms": watch.alarms,
+            "hours": watch.hours,
+            "declared": self._declared,
+            "broken_h": watch.broken_h,
+            "says": self._promise_words(watch),
+        }
 
     def _evidence(self, decision: LiveDecision, here_ns: int, compute_ms: float) -> DetectionTimes:
         ended_ns = self._camera.host_ns(decision.end_us)
@@ -262,6 +323,7 @@ class DetectSink(NullSink):
             "latency_ms": _spread(self._latency),
             "compute_ms": _spread(self._compute),
             "losses": vars(self.detector.losses),
+            "promise": self._promise(),
         }
 
 

@@ -18,10 +18,13 @@ from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.detectors.named import named_detector, needs_training
 from sliplab.analysis.detectors.network_detector import Counting, NetworkDetector, counting_of
 from sliplab.analysis.detectors.registry import make_detector
+from sliplab.analysis.detectors.skin import SUFFIX, load_calibration
 from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.detector_process import DetectorProcess, NetworkProcess
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.schema.detector import DetectorCalibration
 
 
 @dataclass(frozen=True)
@@ -92,16 +95,33 @@ class NamedSource:
     Attributes:
         level: that its evidence must exceed; None: validation trials of `store` set it.
         store: whose trials train it; None where it needs no training.
+        promise: false alarms an hour, at most, at which validation trials set the level; None: at
+            a share of them that is false early.
+        skin: its calibration, where it is the file of one.
     """
 
     name: str
     level: float | None
     store: Path | None
+    promise: float | None = None
+    skin: DetectorCalibration | None = None
 
     @property
     def title(self) -> str:
         """What is shown of it."""
         return f"detector {self.name}"
+
+    def check_rig(self, file: RigFile) -> None:
+        """Raise InputError if its calibration is of another skin, or of a simulated one."""
+        if (skin := self.skin) is None:
+            return
+        again = f"run `sliplab calibrate detector --rig {file.name}`"
+        if skin.skin != file.skin.serial:
+            right = f"must be the skin of the rig {file.name}, '{file.skin.serial}': {again}"
+            raise InputError(self.name, "skin", skin.skin, right)
+        if skin.simulated and not file.simulated:
+            right = f"must be false: the rig {file.name} is real; {again}"
+            raise InputError(self.name, "simulated", "true", right)
 
     @property
     def most(self) -> None:
@@ -110,7 +130,7 @@ class NamedSource:
 
     def detector(self) -> AtLevel:
         """Return the detector in this process; see `named_detector`."""
-        return named_detector(self.name, self.level, self.store)
+        return named_detector(self.name, self.level, self.store, self.promise)
 
     @contextmanager
     def running(
@@ -125,19 +145,25 @@ class NamedSource:
             with closing(self.detector()) as made:
                 yield made
             return
-        with closing(DetectorProcess(self.name, self.level, self.store, answer_s)) as process:
-            yield AtLevel(process, process.level)
+        given = self.name, self.level, self.store, self.promise
+        with closing(DetectorProcess(*given, answer_s=answer_s)) as process:
+            yield AtLevel(process, process.level, process.set_by)
 
 
 Source: TypeAlias = NetworkSource | NamedSource
 
 
-def named_source(name: str, level: float | None, store: Path | None) -> NamedSource:
+def named_source(
+    name: str, level: float | None, store: Path | None, promise: float | None = None
+) -> NamedSource:
     """Check that a detector can be had.
 
     Raises:
         InputError: there is none of the name, or it needs a store.
     """
+    if name.endswith(SUFFIX):
+        skin = load_calibration(Path(name))
+        return NamedSource(name, skin.level if level is None else level, None, promise, skin)
     made = make_detector(name)
     trained = needs_training(made)
     made.close()
@@ -147,4 +173,4 @@ def named_source(name: str, level: float | None, store: Path | None) -> NamedSou
     if store is None and level is None:
         right = f"is needed, or a store as --model, whose validation trials set it for '{name}'"
         raise InputError("--level", "", None, right)
-    return NamedSource(name, level, store)
+    return NamedSource(name, level, store, promise)

@@ -28,6 +28,7 @@ from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
 from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
+from sliplab.storage.schema.detector import DetectorCalibration
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.schema.label import TrialLabel
@@ -46,6 +47,7 @@ DOCUMENTS: dict[str, tuple[type[Document], str]] = {
     "label": (TrialLabel, "The label of a trial of SlipLab"),
     "evaluation": (Evaluation, "An evaluation of SlipLab"),
     "summary": (Summary, "The summary of a report of SlipLab"),
+    "detector": (DetectorCalibration, "The calibration of a detector of SlipLab"),
     "classes": (ClassEvaluation, "An evaluation of SlipLab on recordings of classes"),
     "classes-summary": (
         ClassSummary,

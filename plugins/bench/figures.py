@@ -10,10 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sliplab.analysis.detectors.detector import NO_LABEL
-from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.metrics.intervals import median_interval
-from sliplab.plugins.bench.alarms import (
+from sliplab.analysis.detectors.alarms import (
     Level,
     SceneAlarms,
     SceneEvidence,
@@ -21,6 +18,9 @@ from sliplab.plugins.bench.alarms import (
     outcome,
     worlds_of,
 )
+from sliplab.analysis.detectors.detector import NO_LABEL
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.metrics.intervals import median_interval
 from sliplab.plugins.bench.document import (
     BenchDetector,
     BenchPoint,
@@ -38,7 +38,7 @@ def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[Be
     return tuple(
         BenchPoint(
             asked=level.asked,
-            allowed=level.allowed,
+            allowed=level.found.alarms,
             level=float(level.value) if np.isfinite(level.value) else None,
             promised=level.promised,
             test=scores(scenes, level.value),

@@ -20,17 +20,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
-from sliplab.analysis.detectors.feeding import feed
-from sliplab.analysis.detectors.registry import contents, make_detector
-from sliplab.flows.running import console, stopping
-from sliplab.plugins.bench import scenes
-from sliplab.plugins.bench.alarms import (
+from sliplab.analysis.detectors.alarms import (
     Level,
     SceneEvidence,
     hours_without_slip,
     promised_levels,
 )
+from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.registry import contents, make_detector
+from sliplab.flows.running import console, stopping
+from sliplab.plugins.bench import scenes
 from sliplab.plugins.bench.apart import ApartDetector
 from sliplab.plugins.bench.audit import audit, drawn_edges
 from sliplab.plugins.bench.definition import SIZES, VERSION, Size

@@ -17,11 +17,11 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detectors.alarms import ALARM_US
 from sliplab.analysis.detectors.detectors import DetectionRule, Predictions, first_above
 from sliplab.analysis.detectors.latency import TrueSlip, median_with_lost
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.plugins.bench.alarms import ALARM_US
 from sliplab.plugins.bench.stress.document import (
     ALL,
     HourlyRate,

@@ -56,6 +56,7 @@ WRONG: dict[str, tuple[str, str | None, str | None, str | None]] = {
             "teach tool": f"--rig {GONE}",
             "calibrate lens": f"--rig {GONE}",
             "calibrate crop": f"--rig {GONE}",
+            "calibrate detector": f"--rig {GONE}",
             "calibrate scene": f"{GONE} --rig mock --out ROOM/t.yaml",
             "calibrate drift": f"{GONE} --rig mock",
             "calibrate gap": f"{GONE} --rig t.yaml --protocol pilot --out ROOM/g",

@@ -113,7 +113,7 @@ def test_in_its_process_it_is_the_same_and_a_hang_ends_in_time() -> None:
     x, y = (rng.integers(0, side, 3000).astype(np.uint16) for side in (640, 480))
     given = EventChunk(x, y, rng.integers(0, 2, 3000).astype(np.uint8), t_us)
     scene = Scene("", given, 640, 480, 300_000, Slip(0, 0, 0))
-    process = DetectorProcess("flow", 2.5, None, 30.0)
+    process = DetectorProcess("flow", 2.5, None, answer_s=30.0)
     assert process.level == 2.5
     there, here_too = feed(process, scene), feed(make_detector("flow"), scene)
     np.testing.assert_array_equal(there.value, here_too.value)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sliplab.analysis.detectors.alarms import SceneEvidence, promised_levels
 from sliplab.analysis.detectors.detector import Cost, Detector, Evidence, Scene, Slip
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.registry import make_detector
-from sliplab.plugins.bench.alarms import SceneEvidence, promised_levels
 from sliplab.plugins.bench.document import BenchDetector
 from sliplab.plugins.bench.figures import RATES, tested
 from sliplab.plugins.bench.run import BenchScenes

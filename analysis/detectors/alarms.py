@@ -5,10 +5,13 @@ evidence that is above the level afterwards is the next alarm. So a detector tha
 has an alarm each second. Alarms before the first tip slides are false, in a hold as in the motion
 that follows it. The first alarm after that, before gross slip, detects the slip; where a false
 alarm lasts until the slip, the slip counts as missed, since the alarm does not show it.
+
+The bench, the comparison of a store's detectors and live detection set their levels here.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +24,8 @@ from sliplab.storage.schema.evaluation import AlarmRate
 
 ALARM_US = 1_000_000
 US_PER_HOUR = 3_600_000_000
+BOUND_OF_NONE = -math.log(0.025)
+"""Upper end of the 95 % interval of a Poisson count of which none was seen (Garwood 1936)."""
 
 
 @dataclass(frozen=True)
@@ -119,19 +124,40 @@ def false_alarm_rate(scenes: Sequence[SceneEvidence], level: float) -> AlarmRate
 
 @dataclass(frozen=True)
 class Level:
-    """A level of evidence, set on validation scenes.
+    """A level of evidence, set on scenes that test nothing.
 
     Attributes:
         asked: false alarms an hour.
-        allowed: false alarms of all validation scenes at the level.
+        found: false alarms of these scenes at the level.
         promised: the upper end of their rate's 95 % interval is at most `asked`. If not, there
             were too few hours for that, and the level is that without a false alarm.
     """
 
     asked: float
-    allowed: int
     value: float
+    found: AlarmRate
     promised: bool
+
+    @property
+    def words(self) -> str:
+        """What the level promises, or why it cannot promise what was asked."""
+        if self.promised:
+            return f"at most {self.asked:g} false alarms an hour, 95 % sure"
+        return unsupported(self.asked, self.found)
+
+
+def needed_hours(rate: float) -> float:
+    """Return the hours without slip that show a rate, 1/h, where they have no alarm."""
+    return BOUND_OF_NONE / rate
+
+
+def unsupported(asked: float, found: AlarmRate) -> str:
+    """Return why recorded time cannot promise a rate, 1/h, and how much would."""
+    high = "no rate" if found.high is None else f"it at {found.high:.3g} an hour"
+    return (
+        f"{asked:g} false alarms an hour cannot be promised: {found.hours:.3g} h without slip "
+        f"bound {high}; it takes {needed_hours(asked):.3g} h without an alarm"
+    )
 
 
 def promised_levels(scenes: Sequence[SceneEvidence], rates: Sequence[float]) -> list[Level]:
@@ -159,7 +185,7 @@ def promised_levels(scenes: Sequence[SceneEvidence], rates: Sequence[float]) -> 
         while _below(trial(kept)[1], rate) and (kept == 0 or np.isfinite(trial(kept - 1)[0])):
             kept += 1
         level, alarms = trial(max(kept - 1, 0))
-        found.append(Level(rate, alarms.alarms, level, promised=kept > 0))
+        found.append(Level(rate, level, alarms, promised=kept > 0))
     return found
 
 

@@ -1,0 +1,166 @@
+"""`sliplab calibrate detector` from end to end, and the detector that its document makes."""
+
+from __future__ import annotations
+
+import json
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.analysis.detectors.skin import calibrated, load_calibration
+from sliplab.flows.running import exit_codes, stopping
+from sliplab.protocols import InputError
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.rig import Rig
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.schema.detector import DetectorCalibration
+from tests.docs.nonsense import check_refusals, checker
+from tests.flows.calibrating.test_calibrate import lab, run
+
+QUICK = ("--hold", 5, "--yes", "--json")
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Made on the simulated rig."""
+    out = tmp_path_factory.mktemp("skin") / "skin.json"
+    assert run("calibrate", "detector", "--rig", "mock", "--out", out, *QUICK) == 0
+    return out
+
+
+def test_it_writes_what_this_skin_is(document: Path) -> None:
+    found = load_calibration(document)
+    assert (found.rig, found.skin, found.simulated) == ("mock", "simulated-1", True)
+    assert found.measured == date.today().isoformat()
+    assert (found.width_px, found.height_px, found.cell_px) == (640, 480, 8)
+    assert len(found.places) >= 19, "one for each papilla at least"
+    assert found.hold.hours == pytest.approx(5 / 3600, rel=0.05)
+    assert found.hold.high == pytest.approx(3.689 / found.hold.hours, rel=1e-3)
+    assert found.level >= max(13.0, found.hold_largest, found.unload_largest)
+    assert [rub.direction_deg for rub in found.rubs] == [0.0, 120.0, 240.0]
+    late = [rub.alarm_ms for rub in found.rubs if rub.alarm_ms is not None]
+    assert len(late) >= 2
+    assert all(0 < ms < 1000 for ms in late)
+    made = calibrated(found)
+    assert made.settings.hot == found.hot
+    with pytest.raises(ValueError, match="the sensor has 320 x 240 pixels"):
+        made.begin(320, 240)
+
+
+def test_the_document_has_a_schema(document: Path) -> None:
+    data = read_json(document)
+    assert not list(checker("detector").iter_errors(data))
+    assert DetectorCalibration.parse(data, document).to_json() == data
+    assert check_refusals("detector", document, every=False) > 25
+
+
+def test_it_says_what_so_much_holding_supports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("calibrate", "detector", "--rig", "mock", "--hold", 5, "--yes") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "detector of rig mock (simulated)" in said
+    assert "1 an hour takes 3.69 h (--hold)" in said
+    assert (tmp_path / "mock.detector.json").is_file()
+
+
+def test_a_dry_run_lists_the_motion_and_moves_nothing(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("a dry run builds no rig")
+
+    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
+    assert run("calibrate", "detector", "--rig", "mock", "--dry-run", "--json") == 0
+    moves = json.loads(capsys.readouterr().out)["moves"]
+    assert [move["what"] for move in moves] == ["press", "unload", "rub 1", "rub 2", "rub 3"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--depth", 5), "--depth = 5: is more than the rig may: limits.depth = 4"),
+        (("--rub", 16), "limits.reach = 15"),
+        (("--out", "skin.yaml"), "must end in .json"),
+        (("--out", "nowhere/skin.json"), "its folder does not exist"),
+        (("--rig", "mock_frames"), "has no event camera"),
+    ],
+)
+def test_wrong_input_moves_nothing(
+    arguments: tuple[object, ...],
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("wrong input builds no rig")
+
+    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
+    assert run("calibrate", "detector", "--rig", "mock", *arguments, *QUICK) == (
+        exit_codes.WRONG_INPUT
+    )
+    assert says.split()[-1] in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_stop_leaves_the_arm_at_rest_and_clear(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rigs: list[Rig] = []
+    asked = iter([False] * 400)
+
+    def built(file: Any, should_stop: Any) -> Rig:
+        rigs.append(build_rig(file, should_stop))
+        return rigs[-1]
+
+    monkeypatch.setattr("sliplab.rigs.build.build_rig", built)
+    monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
+    out = tmp_path / "skin.json"
+    found = run("calibrate", "detector", "--rig", lab(tmp_path), "--out", out, *QUICK)
+    assert found == exit_codes.INTERRUPTED
+    assert "the arm is at rest, nothing was written" in capsys.readouterr().err
+    (rig,) = rigs
+    assert next(asked, None) is None, "it had begun to hold"
+    assert rig.arm.progress().done
+    assert rig.position().depth_mm <= -4.9
+    assert not out.exists()
+
+
+def test_a_skin_that_was_not_seen_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "skin.json"
+    shallow = ("--depth", 0.2, "--rub", 0.5)
+    found = run("calibrate", "detector", "--rig", "mock", "--out", out, *shallow, *QUICK)
+    assert found == exit_codes.FAILED
+    assert "nothing was written" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"detector": "rate"}, "detector = rate: must be papillae"),
+        ({"version": 99}, "version = 99: must be 1"),
+        ({"level": "high"}, "level"),
+        ({"format": 2}, "newer version"),
+    ],
+)
+def test_a_document_of_another_kind_is_refused(
+    document: Path, tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    other = tmp_path / "other.json"
+    write_json(other, {**read_json(document), **change})
+    with pytest.raises(InputError, match=says):
+        load_calibration(other)
+
+
+@pytest.mark.realtime
+def test_it_runs_on_the_real_drivers(tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    assert run("calibrate", "detector", "--rig", "loopback", "--out", out, *QUICK) == 0
+    found = load_calibration(out)
+    assert found.simulated
+    assert any(rub.alarm_ms is not None for rub in found.rubs)

@@ -1,0 +1,126 @@
+"""Detectors of a small store at a promise of false alarms, and a calibrated one on its trials."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.campaigns import collected, training_campaigns
+from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.feeding import feed
+from sliplab.analysis.detectors.live import LiveDetector
+from sliplab.analysis.detectors.registry import make_detector
+from sliplab.analysis.detectors.stored_scenes import each_scene
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.flows.detecting.sources import named_source
+from sliplab.flows.evaluations import run_evaluation
+from sliplab.flows.store_detectors import detectors_of
+from sliplab.protocols import InputError
+from sliplab.storage.trials.store import Store
+from tests.command_line import here
+from tests.flows.calibrating.test_calibrate import run
+from tests.flows.conftest import Ran
+
+
+@pytest.fixture(scope="module")
+def store(ran: Ran) -> Store:
+    return Store.open(ran[0][0].store)
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("skin") / "skin.json"
+    words = ("--hold", 5, "--yes", "--json")
+    assert run("calibrate", "detector", "--rig", "rehearsal", "--out", out, *words) == 0
+    return out
+
+
+def test_evaluate_says_that_two_trials_promise_nothing(store: Store) -> None:
+    before = evaluation_of(store)
+    done = run_evaluation(store.folder, None, promise=1.0)
+    assert evaluation_of(store) == before, "what is stored stays the same"
+    rows = done["promise"]
+    assert [row["detector"] for row in rows] == [
+        entry.name for entry in before.detectors.detectors if entry.stride_ms == 10
+    ]
+    for row in rows:
+        assert not row["promised"]
+        assert row["validation"]["alarms"] == 0
+        assert row["validation"]["hours"] < 0.01
+        assert row["says"].startswith("1 false alarms an hour cannot be promised: ")
+        assert row["says"].endswith("it takes 3.69 h without an alarm")
+    assert "promise" not in run_evaluation(store.folder, None)
+
+
+def test_a_promise_that_the_trials_support_is_made(store: Store) -> None:
+    rows = run_evaluation(store.folder, None, promise=1e5)["promise"]
+    assert all(row["promised"] for row in rows)
+    assert {row["says"] for row in rows} == {"at most 100000 false alarms an hour, 95 % sure"}
+
+
+def test_the_command_shows_it(store: Store) -> None:
+    done = here("evaluate", store.folder, "--promise", "1")
+    assert done.returncode == 0
+    assert "hmm counts" in done.stdout
+    assert done.stderr.count("cannot be promised") == 1
+    wrong = here("evaluate", store.folder, "--model", "x.pt", "--promise", "1", "--json")
+    assert json.loads(wrong.stdout)["error"]["key"] == "--promise"
+
+
+def test_detect_has_the_same_levels(store: Store) -> None:
+    rows = {
+        row["detector"]: row for row in run_evaluation(store.folder, None, promise=30)["promise"]
+    }
+    chosen = detectors_of(store.folder, ["cusum counts"], promise=30)["cusum counts"]
+    assert chosen.set_by is not None
+    assert chosen.set_by.words == rows["cusum counts"]["says"]
+    assert chosen.detector.levels.incipient == rows["cusum counts"]["level"]  # type: ignore[union-attr]
+    made = named_source("papillae", None, store.folder, promise=30).detector()
+    assert made.set_by is not None
+    assert not made.set_by.promised
+    assert made.level == made.set_by.value
+
+
+def test_a_calibrated_detector_is_judged_on_stored_trials(store: Store, document: Path) -> None:
+    done = run_evaluation(store.folder, None, model=document)
+    assert done["trials"] == 2
+    assert done["simulated"]
+    assert done["missed"] <= 1
+    assert done["false_alarms"].clusters == 2
+    said = here("evaluate", store.folder, "--model", document)
+    assert said.returncode == 0
+    assert "(simulated)" in said.stdout
+    assert "promised of holding" in said.stdout
+    with pytest.raises(InputError, match="--margin = 2: is of networks"):
+        run_evaluation(store.folder, None, model=document, margin=2)
+
+
+def test_a_running_stream_gives_the_stored_evidence_to_the_bit(
+    store: Store, document: Path
+) -> None:
+    labels, campaigns = StoreLabels(store), training_campaigns(collected(store))
+    rng = np.random.default_rng(2)
+    seen = 0
+    for scene in each_scene(labels, campaigns, "test"):
+        stored = feed(make_detector(str(document)), scene)
+        live = LiveDetector(
+            AtLevel(make_detector(str(document)), 13.0),
+            width=scene.width,
+            height=scene.height,
+            origin_us=5_000,
+        )
+        events = replace(scene.events, t_us=scene.events.t_us + 5_000)
+        cuts = np.sort(rng.integers(0, len(events), 200))
+        made = []
+        for part in np.split(np.arange(len(events)), cuts):
+            made += live.push(events[part])
+        made += live.advance(5_000 + scene.end_us)
+        assert [one.end_us - 5_000 for one in made] == stored.t_us.tolist()
+        assert [one.value for one in made] == stored.value.tolist()
+        seen += int((stored.value > 13).any())
+    assert seen > 0
