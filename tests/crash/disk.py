@@ -94,9 +94,9 @@ class Disk:
         elif call.kind in {"unlink", "rmdir"}:
             assert node is not None
             self._move(node, call.path, None)
-        elif call.kind == "rename":
+        elif call.kind in {"rename", "link"}:
             assert node is not None
-            self._move(node, call.path, call.to)
+            self._move(node, call.path if call.kind == "rename" else None, call.to)
         else:
             raise AssertionError(f"no such call: {call.kind}")
 

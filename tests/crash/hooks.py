@@ -28,6 +28,8 @@ _SIGNATURES: dict[str, tuple[type, ...]] = {
     "fdatasync": (_INT,),
     "rename": (_PATH, _PATH),
     "renameat": (_INT, _PATH, _INT, _PATH),
+    "link": (_PATH, _PATH),
+    "linkat": (_INT, _PATH, _INT, _PATH, _INT),
     "unlink": (_PATH,),
     "unlinkat": (_INT, _PATH, _INT),
     "mkdir": (_PATH, _INT),
@@ -46,6 +48,7 @@ _KINDS = {
     "openat": "open",
     "fdatasync": "fsync",
     "renameat": "rename",
+    "linkat": "link",
     "unlinkat": "unlink",
     "mkdirat": "mkdir",
     "ftruncate": "truncate",
@@ -59,9 +62,9 @@ class Call:
     """One call that changes a file; `go` makes it, `fail` refuses it.
 
     Attributes:
-        kind: open, write, truncate, fsync, rename, unlink, mkdir or rmdir.
+        kind: open, write, truncate, fsync, rename, link, unlink, mkdir or rmdir.
         path: what it changes, absolute.
-        to: the new name of a rename.
+        to: the new name of a rename or a link.
         flags: of an open.
         offset: where a write begins, bytes.
         size: bytes of a write, or the new length of a truncation.
@@ -165,7 +168,7 @@ def _call(name: str, real: Callable[..., int], arguments: tuple[object, ...]) ->
             call.size = int(arguments[1])  # type: ignore[call-overload]
     elif name.endswith("at"):
         call.path = _path(first, arguments[1])
-        if name == "renameat":
+        if name in {"renameat", "linkat"}:
             call.to = _path(arguments[2], arguments[3])
         elif name == "openat":
             call.flags = int(arguments[2])  # type: ignore[call-overload]
@@ -173,7 +176,7 @@ def _call(name: str, real: Callable[..., int], arguments: tuple[object, ...]) ->
             call.kind = "rmdir"
     else:
         call.path = _path(_AT_FDCWD, first)
-        if name == "rename":
+        if name in {"rename", "link"}:
             call.to = _path(_AT_FDCWD, arguments[1])
         elif name == "open":
             call.flags = int(arguments[1])  # type: ignore[call-overload]
