@@ -98,6 +98,7 @@ def _result(
 
 
 def _words(result: dict[str, Any]) -> str:
+    failed = result["failed"]
     lines = [
         f"seed {it['seed']}: {it['wrong']}\n{json.dumps(it['story'])}" for it in result["failed"]
     ]
@@ -105,7 +106,7 @@ def _words(result: dict[str, Any]) -> str:
     if "stories" in result:
         lines.append(
             f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours, "
-            f"{result['hours_an_hour']:.0f} an hour, {len(result['failed'])} failed"
+            f"{result['hours_an_hour']:.0f} an hour, {len(failed)} failed"
         )
     return "\n".join(lines)
 

@@ -9,12 +9,21 @@ import random
 import shutil
 import signal
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.remote.objects import Remote
+from sliplab.storage.remote.pull import pull
+from sliplab.storage.remote.push import push
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
+from tests.crash.campaign import collect, run_request
 from tests.crash.disk import Disk, write_tree
 from tests.crash.hooks import Call, Policy
 from tests.crash.policies import Full, Killer, ReadOnly, Recorder
@@ -227,15 +236,33 @@ def _data(sums: dict[str, str]) -> str:
 
 def play(story: Story) -> Played:
     """Play a story in a folder that is deleted afterwards."""
-    folder = Path(tempfile.mkdtemp(prefix="storm-", dir=_memory()))
-    try:
+    warm()
+    with _folder() as folder:
         return Player(folder, story).play()
+
+
+@cache
+def warm() -> None:
+    """Load code and kernels here, once, for all processes that are forked."""
+    with _folder() as folder:
+        data = run_request(folder / "warm", 2)
+        collect(data)
+        collect(
+            replace(data, rig=load_rig_file(ROOT / "rigs" / "mock_force.yaml")[0], campaign="b")
+        )
+        remote = Remote(f"file://{folder / 'remote'}")
+        push(Store.open(data.store), remote)
+        pull(remote, folder / "pulled")
+
+
+@contextmanager
+def _folder() -> Iterator[Path]:
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    folder = Path(tempfile.mkdtemp(prefix="storm-", dir=memory))
+    try:
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _memory() -> str | None:
-    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 
 
 def shrink(story: Story, wrong: Wrong, most: int = MOST_SHORTER) -> Story:

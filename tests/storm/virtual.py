@@ -15,8 +15,8 @@ from typing import Any
 
 from sliplab.rigs.mock.world import SimulatedWorld
 
-BEGIN_S = 1_800_000_000.0
-"""Time of the host when a story begins, seconds since 1970."""
+BEGIN_S = 1_795_456_800.0
+"""Time of the host when a story begins, seconds since 1970: the past, for caches have dates."""
 _Usage = namedtuple("_Usage", ("total", "used", "free"))
 
 
