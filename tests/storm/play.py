@@ -185,6 +185,7 @@ class Player:
             "ArmFault": bool(step.get("faults")),
             "GuardError": bool(step.get("faults")),
             "StoreError": bool(weather) or _has(step, "disk_full"),
+            "OSError": bool(weather),
             "RemoteError": bool(step.get("fails") or weather),
         }
         known = {"NoPushedStore": "RemoteError", "RemoteMissing": "RemoteError"}

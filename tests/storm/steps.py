@@ -13,14 +13,14 @@ from typing import Any
 
 import yaml
 
+from sliplab.flows.cli.errors import failure
 from sliplab.flows.collecting import supervisor as supervising
+from sliplab.flows.collecting.requests import ask as ask_for
 from sliplab.flows.collecting.requests import (
-    CampaignStopped,
     carry_out,
     refuse_paused,
     store_lock,
 )
-from sliplab.flows.collecting.requests import ask as ask_for
 from sliplab.flows.collecting.session import open_session, refresh
 from sliplab.flows.collecting.supervisor import SessionListener
 from sliplab.flows.log import add_note
@@ -28,7 +28,6 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.storage.errors import StoreError
 from sliplab.storage.remote import pull as pulling
@@ -42,8 +41,6 @@ from sliplab.storage.trials.verify import verify
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
 
-EXPLAINED = (RigError, StoreError, CampaignStopped, Locked, InputError)
-"""Errors whose message is the program's answer; any other is a fault."""
 NIGHT_S = 4 * 3600.0
 """Bound of a night of some trials, pauses of 12 hours apart."""
 
@@ -96,11 +93,12 @@ class Process:
             self.notes.add(end="done")
         except (KeyboardInterrupt, StopRequested):
             self.notes.add(end="stopped")
-        except EXPLAINED as error:
-            self.notes.add(end=type(error).__name__, text=self.scrubbed(str(error)))
         except Exception as error:
-            self.notes.add(wrong="errors are explained", what=self.scrubbed(repr(error)))
-            raise
+            told = failure(error)
+            if told.trace:
+                self.notes.add(wrong="errors are explained", what=self.scrubbed(repr(error)))
+                raise
+            self.notes.add(end=type(error).__name__, text=self.scrubbed(told.message))
         left = _handles() - handles
         if left or threading.active_count() > threads:
             names = sorted(thread.name for thread in threading.enumerate())

@@ -75,20 +75,20 @@ def draw(seed: int) -> Story:
 
 
 def _protocol(rng: random.Random) -> dict[str, Any]:
-    data = protocol(rng.randint(3, 8))
+    data = protocol(rng.randint(3, 10))
     data["name"] = "storm"
     collection = data["collection"]
     collection["seed"] = rng.randrange(10_000)
     factors = collection["factors"]
     factors["depth"]["values"] = [rng.choice([2.0, 2.4, 3.2])]
-    factors["speed"]["values"] = [rng.choice([0.8, 1.6, 4.0])]
+    factors["speed"]["values"] = [rng.choice([0.4, 0.4, 1.6, 4.0])]
     collection["motion"][3]["distance"] = f"{rng.choice([1.6, 4, 8])} mm"
-    settle, hold = rng.choice([0.2, 3]), rng.choice([0.5, 5])
+    settle, hold = rng.choice([0.2, 10]), rng.choice([0.5, 5])
     collection["motion"][2] |= {"settle": f"{settle} s", "duration": f"{hold} s"}
     collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0036 ms"])
     collection["gates"]["retakes"] = rng.choice([0, 2])
     warm_up = {"presses": 2, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
-    rezero = {"every": rng.choice([2, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
+    rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
     both = {"warm_up": warm_up, "rezero": rezero}
     collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
     return data
@@ -177,7 +177,7 @@ def _event(rng: random.Random, story: Story, trials: int) -> Step:
             {"rival": True},
         ]
     )
-    return {"at_s": round(rng.uniform(0, 120), 2), **made}
+    return {"at_s": round(rng.uniform(0, 250), 2), **made}
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
