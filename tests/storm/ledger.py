@@ -17,8 +17,8 @@ from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify_trial
+from tests.storm.steps import NAME
 
-NAME = "storm"
 LATER = {"cause.json"}
 """Files of an attempt in quarantine that a request may change."""
 DEVICES = {"events": "event_camera", "frames": "frame_camera", "arm": "arm"}
@@ -59,6 +59,7 @@ class Ledger:
         self.logged: list[str] = []
         self.asked: dict[int, str] = {}
         self._known: dict[tuple[Any, ...], str] = {}
+        self._status: StatusReader | None = None
 
     def look(self, notes: list[dict[str, Any]], ended: bool) -> None:
         """Hold the store against the record after a step, and record what is new.
@@ -232,7 +233,9 @@ class Ledger:
         """What `sliplab status` says is what is on the disk."""
         if not (self._campaign / "campaign.json").exists():
             return
-        found = StatusReader(Store.open(self._folder)).read()
+        if self._status is None:
+            self._status = StatusReader(Store.open(self._folder))
+        found = self._status.read()
         if found.running is not None:
             raise Wrong("nothing is left open", "the store is still held")
         (one,) = found.campaigns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import os
@@ -28,8 +29,8 @@ from tests.crash.disk import Disk, write_tree
 from tests.crash.hooks import Call, Policy
 from tests.crash.policies import Full, Killer, ReadOnly, Recorder
 from tests.crash.process import End, live
-from tests.storm.ledger import NAME, Ledger, Wrong
-from tests.storm.steps import Process, Stage
+from tests.storm.ledger import Ledger, Wrong
+from tests.storm.steps import NAME, Process, Stage
 from tests.storm.story import Story, shorter
 from tests.storm.virtual import BEGIN_S, Host, Notes
 
@@ -113,6 +114,7 @@ class Player:
     def __init__(self, folder: Path, story: Story) -> None:
         self._stage = Stage(folder, story)
         self._stage.data.mkdir(parents=True)
+        _ = self._stage.trials  # read once, for all processes
         self._ledger = Ledger(self._stage.store)
         self._notes = Notes(folder / "notes")
         self._wall_s = BEGIN_S
@@ -254,6 +256,8 @@ def warm() -> None:
         remote = Remote(f"file://{folder / 'remote'}")
         push(Store.open(data.store), remote)
         pull(remote, folder / "pulled")
+    gc.collect()
+    gc.freeze()  # or each forked process copies what it counts
 
 
 @contextmanager

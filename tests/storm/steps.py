@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ from sliplab.storage.trials.verify import verify
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
 
+NAME = "storm"
+"""Of the campaign."""
 NIGHT_S = 4 * 3600.0
 """Bound of a night of some trials, pauses of 12 hours apart."""
 
@@ -65,6 +67,11 @@ class Stage:
     def store(self) -> Path:
         """The store."""
         return self.data / "store"
+
+    @cached_property
+    def trials(self) -> tuple[str, ...]:
+        """Ids of the planned trials, in their order."""
+        return tuple(trial.id for trial in self.request([]).plan)
 
     def request(self, faults: list[dict[str, Any]], most: int | None = None) -> RunRequest:
         """Return the request to collect on a rig with these faults."""
@@ -150,7 +157,7 @@ def night(process: Process, step: dict[str, Any]) -> None:
     witness = Witness(request.rig, host, notes)
     witness.install()
     host.events = [
-        (event["at_s"], partial(happen, process, event, request, witness))
+        (event["at_s"], partial(happen, process, event, witness))
         for event in step.get("events", [])
     ]
     store = Store.create(stage.store)
@@ -178,7 +185,7 @@ def _wait(host: Host, seconds: float) -> None:
     stopping.check()
 
 
-def happen(process: Process, event: dict[str, Any], request: RunRequest, witness: Witness) -> None:
+def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
     """Let something happen in the middle of a night."""
     if "signal" in event:
         witness.stop_asked()
@@ -200,24 +207,22 @@ def happen(process: Process, event: dict[str, Any], request: RunRequest, witness
             if "log" in event:
                 _log(process, event["log"])
             else:
-                _file_request(process, event, request)
+                _file_request(process, event)
         except (OSError, StoreError, InputError) as error:
             process.notes.add(refused=type(error).__name__)
 
 
-def _file_request(process: Process, wanted: dict[str, Any], request: RunRequest) -> None:
+def _file_request(process: Process, wanted: dict[str, Any]) -> None:
     store, kind = Store.open(process.stage.store), wanted["ask"]
-    ids = _ids(request, wanted)
-    if ids and not store.campaign(request.campaign).begun:
+    ids = _ids(process, wanted)
+    if ids and not store.campaign(NAME).begun:
         return
-    made = control.ask(
-        store, kind, who="anna", campaign=request.campaign if ids else "", trials=ids
-    )
+    made = control.ask(store, kind, who="anna", campaign=NAME if ids else "", trials=ids)
     process.notes.add(asked=kind, number=made.number, trials=ids)
 
 
-def _ids(request: RunRequest, wanted: dict[str, Any]) -> tuple[str, ...]:
-    every = [trial.id for trial in request.plan]
+def _ids(process: Process, wanted: dict[str, Any]) -> tuple[str, ...]:
+    every = process.stage.trials
     return tuple(every[index % len(every)] for index in wanted.get("trials", ()))
 
 
@@ -226,14 +231,13 @@ def _ids(request: RunRequest, wanted: dict[str, Any]) -> tuple[str, ...]:
 
 def ask(process: Process, step: dict[str, Any]) -> None:
     """Ask for something while no collection runs."""
-    request = process.stage.request([])
     if not Store.exists(process.stage.store):
         return
-    store, ids = Store.open(process.stage.store), _ids(request, step)
-    if ids and not store.campaign(request.campaign).begun:
+    store, ids = Store.open(process.stage.store), _ids(process, step)
+    if ids and not store.campaign(NAME).begun:
         return
     process.notes.add(asks=step["ask"], trials=ids)
-    campaign = request.campaign if ids else ""
+    campaign = NAME if ids else ""
     with stopping.signals():
         done = ask_for(store, step["ask"], who="ben", campaign=campaign, trials=ids, limit_s=0)
     process.notes.add(asked=step["ask"], number=done.request.number, trials=ids)
@@ -251,7 +255,7 @@ def _log(process: Process, step: dict[str, Any]) -> None:
     store = Store.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
-    if context and not store.campaign("storm").begun:
+    if context and not store.campaign(NAME).begun:
         return
     add_note(store, text, who="anna", context=context)
     process.notes.add(logged=text)
@@ -268,7 +272,7 @@ def check(process: Process, step: dict[str, Any]) -> None:
 
 def damage(process: Process, step: dict[str, Any]) -> None:
     """A disk loses the end of a committed trial's data."""
-    folder = process.stage.store / "campaigns" / "storm" / "trials"
+    folder = process.stage.store / "campaigns" / NAME / "trials"
     trials = sorted(folder.iterdir()) if folder.is_dir() else []
     if trials:
         trial = trials[step["trial"] % len(trials)]

@@ -75,7 +75,7 @@ def draw(seed: int) -> Story:
 
 
 def _protocol(rng: random.Random) -> dict[str, Any]:
-    data = protocol(rng.randint(3, 10))
+    data = protocol(rng.randint(4, 12))
     data["name"] = "storm"
     collection = data["collection"]
     collection["seed"] = rng.randrange(10_000)

@@ -42,7 +42,7 @@ class Witness:
         self._host, self._notes = host, notes
         self._asked_s: float | None = None
         self._starts = 0
-        self._outside_s: float | None = None
+        self._outside: tuple[float, float] | None = None
         self.resumed = False
         self._rezeroes = False
 
@@ -136,9 +136,10 @@ class Witness:
             late = now_s - self._asked_s
             if late > self._poll_s + 1e-3:
                 self.wrong("stops in time", f"still moves {late:.3f} s after it was asked to stop")
-        if not (moving and self._excess(place) > PLATE_MM):
-            self._outside_s = None
-        elif self._outside_s is None:
-            self._outside_s = now_s
-        elif now_s - self._outside_s > self._poll_s + SLACK_S and self._asked_s is None:
-            self.wrong("within limits", f"moves on {self._excess(place):.2f} mm outside")
+        over = self._excess(place)
+        if not (moving and over > PLATE_MM):
+            self._outside = None
+        elif self._outside is None or over <= self._outside[1]:  # it may come back
+            self._outside = now_s, over
+        elif now_s - self._outside[0] > self._poll_s + SLACK_S:
+            self.wrong("within limits", f"moves on {over:.2f} mm outside")
