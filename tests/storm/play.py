@@ -26,7 +26,7 @@ from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.crash.campaign import collect, run_request
 from tests.crash.disk import Disk, write_tree
-from tests.crash.hooks import Call, Policy
+from tests.crash.hooks import Call, Policy, entries
 from tests.crash.policies import Full, Killer, ReadOnly, Recorder
 from tests.crash.process import End, live
 from tests.storm.ledger import Ledger, Wrong
@@ -256,6 +256,7 @@ def warm() -> None:
         remote = Remote(f"file://{folder / 'remote'}")
         push(Store.open(data.store), remote)
         pull(remote, folder / "pulled")
+    entries()
     gc.collect()
     gc.freeze()  # or each forked process copies what it counts
 

@@ -68,8 +68,8 @@ def draw(seed: int) -> Story:
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
     steps = []
-    for _ in range(rng.randint(4, 8)):
-        kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0]
+    for number in range(rng.randint(4, 8)):
+        kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         steps.append({"do": kind, **STEPS[kind][1](rng, story, trials)})
     return {**story, "steps": steps}
 
