@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -92,9 +93,16 @@ def _result(
         "campaign_hours": round(rig_s / 3600, 3),
         "minutes": round(took_s / 60, 2),
         "hours_an_hour": round(rig_s / took_s, 1),
+        "hours_a_processor_hour": round(rig_s / max(_processor_s(), 1e-9), 1),
         "hashes": hashes,
         "failed": failed,
     }
+
+
+def _processor_s() -> float:
+    """Return the processor's time of this process and its children, s."""
+    spent = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in spent)
 
 
 def _words(result: dict[str, Any]) -> str:
@@ -106,7 +114,8 @@ def _words(result: dict[str, Any]) -> str:
     if "stories" in result:
         lines.append(
             f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours, "
-            f"{result['hours_an_hour']:.0f} an hour, {len(failed)} failed"
+            f"{result['hours_an_hour']:.0f} an hour ({result['hours_a_processor_hour']:.0f} of a "
+            f"processor's), {len(failed)} failed"
         )
     return "\n".join(lines)
 

@@ -91,6 +91,7 @@ class Ledger:
                 self.again.update(note["trials"])
             if "damaged" in note:
                 self.damaged.add(note["damaged"])
+                self._status = None  # one that is kept reads a trial once
             if "logged" in note:
                 self.logged.append(note["logged"])
             if "number" in note:
@@ -154,6 +155,11 @@ class Ledger:
         record = Recording(folder).record
         if not record.simulated or not Campaign(self._campaign).info["simulated"]:
             raise Wrong("nothing simulated is unmarked", name)
+        for gate, found in record.quality.gates.items():
+            if isinstance(found.value, float) and found.limit is not None:
+                if not (found.passed and found.value <= found.limit):
+                    what = f"{name}: {gate} = {found.value:g}, limit {found.limit:g}"
+                    raise Wrong("what is committed passed its gates", what)
         truth = (record.simulation_truth or {}).get("clocks", {})
         for device, clock in record.clocks.devices().items():
             pairs = np.array(truth.get(DEVICES.get(device, device), ()))

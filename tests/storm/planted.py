@@ -191,13 +191,9 @@ def unmarked() -> None:
 def interval_narrow() -> None:
     """The stated uncertainty of a clock is a twentieth of what it is."""
     made = synchronise.DeviceSync.record
-
-    def narrow(self: Any) -> Any:
-        return replace(self, uncertainty_ns=self.uncertainty_ns / 20) and made(
-            replace(self, uncertainty_ns=self.uncertainty_ns / 20)
-        )
-
-    synchronise.DeviceSync.record = narrow  # type: ignore[method-assign]
+    synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
+        replace(self, uncertainty_ns=self.uncertainty_ns / 20)
+    )
 
 
 @plant
