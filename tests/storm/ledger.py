@@ -156,10 +156,10 @@ class Ledger:
         if not record.simulated or not Campaign(self._campaign).info["simulated"]:
             raise Wrong("nothing simulated is unmarked", name)
         for gate, found in record.quality.gates.items():
-            if isinstance(found.value, float) and found.limit is not None:
-                if not (found.passed and found.value <= found.limit):
-                    what = f"{name}: {gate} = {found.value:g}, limit {found.limit:g}"
-                    raise Wrong("what is committed passed its gates", what)
+            value, limit = found.value, found.limit
+            clock = gate.startswith("sync_uncertainty")
+            if not found.passed or (clock and not float(value or 0) <= float(limit or 0)):
+                raise Wrong("what is committed passed its gates", f"{name}: {gate} = {value}")
         truth = (record.simulation_truth or {}).get("clocks", {})
         for device, clock in record.clocks.devices().items():
             pairs = np.array(truth.get(DEVICES.get(device, device), ()))
@@ -190,16 +190,11 @@ class Ledger:
             and not verify_trial(folder / name)
             and name not in self.trials
         }
-        done = [note["recorded"] for note in notes if "recorded" in note]
-        if not ended:
-            return
-        for name in {*done}:
-            if name not in kept | incoming:
-                raise Wrong("nothing complete is thrown away", f"{name} was recorded")
-        committed = [note["trial"] for note in notes if note.get("outcome") == "committed"]
-        for name in committed:
-            if name not in kept:
-                raise Wrong("nothing committed is lost or changed", f"{name} was reported")
+        for note in notes:
+            if note.get("outcome") == "committed" and note["trial"] not in kept:
+                raise Wrong("nothing committed is lost or changed", f"{note['trial']} was reported")
+            if ended and "recorded" in note and note["recorded"] not in kept | incoming:
+                raise Wrong("nothing complete is thrown away", f"{note['recorded']} was recorded")
 
     def _set_aside(self, trial: str) -> list[str]:
         return [

@@ -56,6 +56,8 @@ FAULTS: dict[str, Draw] = {
     "stream_gone": lambda rng: {"stream": "warm"},
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
+CALLS = {"write": 10.2, "fsync": 6.2, "rename": 3.8, "any": 10.4}
+"""Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
 ALONE = {"mains_light", "arm_ramp"}
 """Kinds of which a trial has one at most."""
@@ -99,7 +101,7 @@ def _rig(rng: random.Random) -> dict[str, Any]:
         "extends": str(ROOT / "rigs" / "rehearsal.yaml"),
         "name": "storm",
         "mock": {"seed": rng.randrange(1000)},
-        "poll": rng.choice(["0.2 s", "1 s"]),
+        "poll": rng.choice(["0.5 s", "1 s", "1 s", "1 s"]),
         # close around the motion, so that leaving the path is leaving the limits
         "limits": {"depth": "3.4 mm", "speed": "50 mm/s", "reach": "9 mm"},
     }
@@ -142,12 +144,13 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
 def _weather(rng: random.Random, share: float = 0.5) -> dict[str, Any]:
     if rng.random() > share:
         return {}
-    at = max(1, round(2 ** rng.uniform(0, 9)))
-    kill = {"kind": rng.choice(["write", "fsync", "rename", "any"]), "at": at}
+    kind = rng.choice([*CALLS])
+    kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
+    cut = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
     made: Step = rng.choice(
         [
             {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
-            {"power": {"at": at, "torn": rng.choice([None, rng.randrange(1000)])}},
+            {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
             {"full": {"room": round(2 ** rng.uniform(8, 22)), "errno": rng.choice([28, 28, 5])}},
             {"low": {"free": rng.choice([0, 150_000_000])}},
             {"read_only": {}},
