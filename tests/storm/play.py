@@ -60,7 +60,7 @@ class Played:
 
 
 class PowerCut:
-    """Cuts the power after so many changes: what was not flushed is lost, or torn.
+    """Cuts the power after so many changes, or at the end: what was not flushed is lost, or torn.
 
     Args:
         before: the disk when the process began. after: where what is left is put.
@@ -73,29 +73,29 @@ class PowerCut:
     def __call__(self, call: Call) -> int:
         """Make the call; the last one ends the process."""
         result = self._recorder(call)
-        if len(self._recorder.done) < self._at:
-            return result
+        if len(self._recorder.done) >= self._at:
+            self.cut()
+        return result
+
+    def cut(self) -> None:
+        """Put what is left in its place, and end this process."""
         for done in self._recorder.done:
             self._before.make(done)
         torn = self._torn
         tree = self._before.left() if torn is None else self._before.torn(random.Random(torn))
         write_tree(tree, self._after)
         os.kill(os.getpid(), signal.SIGKILL)
-        raise AssertionError("outlived a SIGKILL")
 
 
 def _policy(weather: dict[str, Any], stage: Stage) -> Policy | None:
     """Return what stands between a step's process and its disk."""
-    made: Policy | None = None
     if "kill" in weather:
-        made = Killer(**weather["kill"])
-    elif "power" in weather:
-        made = PowerCut(Disk(stage.data), stage.folder / "after", **weather["power"])
-    elif "full" in weather:
-        made = Full(weather["full"]["room"], weather["full"]["errno"])
-    elif "read_only" in weather:
-        made = ReadOnly()
-    return None if made is None else _but_locks(made)
+        return Killer(**weather["kill"])
+    if "power" in weather:
+        return PowerCut(Disk(stage.data), stage.folder / "after", **weather["power"])
+    if "full" in weather:
+        return Full(weather["full"]["room"], weather["full"]["errno"])
+    return ReadOnly() if "read_only" in weather else None
 
 
 def _but_locks(policy: Policy) -> Policy:
@@ -136,15 +136,19 @@ class Player:
         free = weather.get("low", {}).get("free", 50_000_000_000)
         host = Host(self._wall_s + NIGHT_GAP_S, notes, free)
 
+        policy = _policy(weather, stage)
+
         def work() -> None:
             host.install()
             try:
                 Process(stage, host, notes).run(step)
             finally:
                 notes.add(wall_s=host.wall_s, rig_s=host.rig_s)
+            if isinstance(policy, PowerCut):
+                policy.cut()
 
         try:
-            end = live(work, stage.data, _policy(weather, stage))
+            end = live(work, stage.data, None if policy is None else _but_locks(policy))
         except TimeoutError as error:
             raise Wrong("waits are bounded", str(error)[:300]) from None
         if (stage.folder / "after").exists():
@@ -153,7 +157,7 @@ class Player:
         found = notes.take()
         self._wall_s = next((n["wall_s"] for n in found if "wall_s" in n), host.wall_s)
         self.played.rig_s += sum(note.get("rig_s", 0.0) for note in found)
-        how = next((note["end"] for note in found if "end" in note), "killed")
+        how = next((note["end"] for note in found if "end" in note and not end.killed), "killed")
         text = next((note["text"] for note in found if "text" in note), "")
         self.played.trace += [f"{name}: {json.dumps(note)}" for note in found]
         self._check_end(step, end, found, how, text)

@@ -56,7 +56,7 @@ FAULTS: dict[str, Draw] = {
     "stream_gone": lambda rng: {"stream": "warm"},
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
-CALLS = {"write": 10.2, "fsync": 6.2, "rename": 3.8, "any": 10.4}
+CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
 ALONE = {"mains_light", "arm_ramp"}
@@ -77,7 +77,7 @@ def draw(seed: int) -> Story:
 
 
 def _protocol(rng: random.Random) -> dict[str, Any]:
-    data = protocol(rng.randint(4, 12))
+    data = protocol(rng.randint(3, 6))
     data["name"] = "storm"
     collection = data["collection"]
     collection["seed"] = rng.randrange(10_000)
