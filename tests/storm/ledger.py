@@ -51,6 +51,7 @@ class Ledger:
         self._folder, self._campaign = folder, folder / "campaigns" / NAME
         self.trials: dict[str, Sums] = {}
         self.aside: dict[str, Sums] = {}
+        self.imported: dict[str, Sums] = {}
         self.files: Sums = {}
         self.damaged: set[str] = set()
         self.owed: set[str] = set()
@@ -80,6 +81,7 @@ class Ledger:
         self._check_aside(aside)
         self._check_trials(aside)
         self._check_recorded(notes, ended)
+        self._check_imported(notes)
         self._check_journals()
         self._check_status()
 
@@ -195,6 +197,18 @@ class Ledger:
                 raise Wrong("nothing committed is lost or changed", f"{note['trial']} was reported")
             if ended and "recorded" in note and note["recorded"] not in kept | incoming:
                 raise Wrong("nothing complete is thrown away", f"{note['recorded']} was recorded")
+
+    def _check_imported(self, notes: list[dict[str, Any]]) -> None:
+        folder = self._folder / "campaigns" / "copied" / "trials"
+        now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
+        reported = {note["imported"] for note in notes if "imported" in note}
+        for name in self.imported.keys() | reported:
+            if name not in now or self.imported.get(name, now[name]) != now[name]:
+                raise Wrong("nothing committed is lost or changed", f"copied/{name}")
+        for name in now.keys() - self.imported.keys():
+            for problem in verify_trial(folder / name):
+                raise Wrong("what is committed is whole", f"copied/{name}: {problem.what}")
+        self.imported = now
 
     def _set_aside(self, trial: str) -> list[str]:
         return [

@@ -211,6 +211,8 @@ class Player:
                 break
         if how != "done":
             raise Wrong("what a message advises works", f"a calm night ended: {how}")
+        if (self._stage.folder / "one.h5").exists():  # what an import has left, it clears up
+            self._step("end import", {"do": "import"})
         store = Store.open(self._stage.store)
         for problem in verify(store):
             what = f"{problem.path}: {problem.what}".replace(str(self._stage.folder), "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from sliplab.flows.collecting.requests import (
 )
 from sliplab.flows.collecting.session import open_session, refresh
 from sliplab.flows.collecting.supervisor import SessionListener
+from sliplab.flows.imports import import_data
 from sliplab.flows.log import add_note
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import stopping
@@ -281,6 +283,19 @@ def damage(process: Process, step: dict[str, Any]) -> None:
         os.truncate(trial / "data.h5", 1000)
 
 
+def bring(process: Process, step: dict[str, Any]) -> None:
+    """Import a recording of another program: here a copy of a trial's own data."""
+    file = process.stage.folder / "one.h5"
+    folder = process.stage.store / "campaigns" / NAME / "trials"
+    if not file.exists():
+        trials = sorted(folder.iterdir()) if folder.is_dir() else []
+        if not trials:
+            return
+        shutil.copy(trials[0] / "data.h5", file)
+    import_data(file, process.stage.store, name="copied", simulated=True)
+    process.notes.add(imported="one")
+
+
 def _remote(process: Process, fails: int) -> Remote:
     """Return the URL of the copy, which fails at every so manieth object."""
     folder = process.stage.data / "remote"
@@ -321,6 +336,7 @@ DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "log": log,
     "verify": check,
     "damage": damage,
+    "import": bring,
     "push": send,
     "pull": fetch,
 }

@@ -141,21 +141,21 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
     return found
 
 
-def _weather(rng: random.Random, share: float = 0.5) -> dict[str, Any]:
+def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
     if rng.random() > share:
         return {}
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
-    made: Step = rng.choice(
-        [
-            {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
-            {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
-            {"full": {"room": round(2 ** rng.uniform(8, 22)), "errno": rng.choice([28, 28, 5])}},
-            {"low": {"free": rng.choice([0, 150_000_000])}},
-            {"read_only": {}},
-        ]
-    )
+    full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
+    drawn: list[Step] = [
+        {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
+        {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
+        {"full": full},
+        {"low": {"free": rng.choice([0, 150_000_000])}},
+        {"read_only": {}},
+    ]
+    made = rng.choices(drawn, [4, 4, 2, 1, 1])[0]
     return {"weather": made}
 
 
@@ -203,6 +203,7 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
     "verify": (0.5, lambda rng, story, trials: {}),
     "damage": (0.3, lambda rng, story, trials: {"trial": rng.randrange(trials)}),
+    "import": (0.5, lambda rng, story, trials: _weather(rng)),
     "push": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
     "pull": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
 }
