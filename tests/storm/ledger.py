@@ -11,6 +11,7 @@ import numpy as np
 
 from sliplab.flows.log import log_entries
 from sliplab.flows.status import StatusReader
+from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import incomplete
@@ -77,13 +78,17 @@ class Ledger:
             if self.trials or self.files:
                 raise Wrong("nothing committed is lost", "the store is gone")
             return
-        aside = self._folders("quarantine")
-        self._check_aside(aside)
-        self._check_trials(aside)
-        self._check_recorded(notes, ended)
-        self._check_imported(notes)
-        self._check_journals()
-        self._check_status()
+        try:
+            aside = self._folders("quarantine")
+            self._check_aside(aside)
+            self._check_trials(aside)
+            self._check_recorded(notes, ended)
+            self._check_imported(notes)
+            self._check_journals()
+            self._check_status()
+        except (OSError, ValueError, KeyError, StoreError) as error:
+            what = repr(error).replace(str(self._folder), "")
+            raise Wrong("what is kept can be read", what) from error
 
     def _read(self, notes: list[dict[str, Any]]) -> None:
         for note in notes:

@@ -193,9 +193,11 @@ class Player:
             "StoreError": bool(weather) or _has(step, "disk_full"),
             "OSError": bool(weather),
             "RemoteError": bool(step.get("fails") or weather),
+            # an earlier push was ended before its first trial
+            "NoPushedStore": step["do"] == "pull",
+            "RemoteMissing": step["do"] == "pull",
         }
-        known = {"NoPushedStore": "RemoteError", "RemoteMissing": "RemoteError"}
-        kind = known.get(how, "GuardError" if text.startswith("arm: ") else how)
+        kind = "GuardError" if text.startswith("arm: ") else how
         if (kind == "GuardError" and not step.get("faults")) or not why.get(kind, False):
             raise Wrong("errors are explained", f"{how}: {text[:300]}")
 
