@@ -23,8 +23,8 @@ from tests.storm.steps import NAME
 LATER = {"cause.json"}
 """Files of an attempt in quarantine that a request may change."""
 DEVICES = {"events": "event_camera", "frames": "frame_camera", "arm": "arm"}
-SIGMA = 1.5
-"""Times its stated uncertainty up to which a clock's error is accepted: some are of 95 %."""
+TIMES = {"95 %": 3.0}
+"""Times its stated uncertainty up to which a clock's error is accepted, by what that states."""
 
 Sums = dict[str, str]
 
@@ -173,7 +173,7 @@ class Ledger:
             if not len(pairs) or clock.grade == "host arrival" or clock.uncertainty_ns is None:
                 continue
             error = np.abs(np.asarray(clock.map.to_reference(pairs[:, 0])) - pairs[:, 1]).max()
-            if error > SIGMA * clock.uncertainty_ns + 1:
+            if error > TIMES.get(clock.kind or "", 1.0) * clock.uncertainty_ns + 1:
                 what = f"{name}: {device} is {error:.0f} ns off, stated {clock.uncertainty_ns:.0f}"
                 raise Wrong("no time is wrong beyond its interval", what)
 
