@@ -13,11 +13,12 @@ from sliplab.flows.log import log_entries
 from sliplab.flows.status import StatusReader
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
+from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
-from sliplab.storage.trials.verify import verify_trial
+from sliplab.storage.trials.verify import content_problems, verify_trial
 from tests.storm.steps import NAME
 
 LATER = {"cause.json"}
@@ -56,7 +57,8 @@ class Ledger:
         self.files: Sums = {}
         self.damaged: set[str] = set()
         self.owed: set[str] = set()
-        self.unfinished: set[str] = set()
+        self.unfinished: dict[str, Sums] = {}
+        self.counts: Counter[str] = Counter()
         self.again: Counter[str] = Counter()
         self.logged: list[str] = []
         self.asked: dict[int, str] = {}
@@ -182,26 +184,26 @@ class Ledger:
         kept = {*self.trials, *(name.rpartition(".")[0] for name in self.aside)}
         folder = self._campaign / "incoming"
         incoming = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        for name in self.unfinished - incoming - kept:
-            raise Wrong("nothing complete is thrown away", f"incoming/{name} is gone")
-        self.unfinished = incoming
-        for name in self.owed - incoming - {*self.trials}:
-            gates = [item for item in self._set_aside(name) if item.startswith(("gate", "again"))]
-            if not gates:
+        for name, sums in self.unfinished.items():
+            if name in incoming or self._recovered(name, sums):
+                continue
+            causes = self._set_aside(name)
+            if len(causes) <= self.counts[name]:
+                raise Wrong("nothing complete is thrown away", f"incoming/{name} is gone")
+            if name in self.owed and not causes[-1].startswith(("gate", "again")):
                 raise Wrong("nothing complete is thrown away", f"{name} had its record")
-        self.owed = {
-            name
-            for name in incoming
-            if (folder / name / "checksums.json").exists()
-            and not (folder / name / "cause.json").exists()
-            and not verify_trial(folder / name)
-            and name not in self.trials
-        }
+        self.unfinished = {name: self._sums(folder / name) for name in incoming}
+        self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
+        self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
         for note in notes:
             if note.get("outcome") == "committed" and note["trial"] not in kept:
                 raise Wrong("nothing committed is lost or changed", f"{note['trial']} was reported")
             if ended and "recorded" in note and note["recorded"] not in kept | incoming:
                 raise Wrong("nothing complete is thrown away", f"{note['recorded']} was recorded")
+
+    def _recovered(self, name: str, sums: Sums) -> bool:
+        """Return whether a trial was committed with the data that it had unfinished."""
+        return "data.h5" in sums and self.trials.get(name, {}).get("data.h5") == sums["data.h5"]
 
     def _check_imported(self, notes: list[dict[str, Any]]) -> None:
         folder = self._folder / "campaigns" / "copied" / "trials"
@@ -283,6 +285,18 @@ class Ledger:
                 elif request.kind == "again":
                     found.discard(trial)
         return found
+
+
+def _is_complete(folder: Path) -> bool:
+    """Return whether an unfinished trial has its record, and all that this states."""
+    if not (folder / "record.json").exists() or (folder / "cause.json").exists():
+        return False
+    try:
+        if (folder / "checksums.json").exists():
+            return not verify_trial(folder)
+        return not content_problems(folder, TrialRecord.load(folder / "record.json"))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError):
+        return False
 
 
 def _without(sums: Sums) -> Sums:

@@ -11,7 +11,7 @@ import numpy as np
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.protocols import Plan, Trial
-from sliplab.rigs.core.capabilities import Segment
+from sliplab.rigs.core.capabilities import ArmState, Segment
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.world import SimulatedWorld
@@ -103,7 +103,7 @@ class Witness:
 
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
         here = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
-        if not world.arm_state.healthy:
+        if world.arm_state is ArmState.PROTECTIVE_STOP:
             self.wrong("no motion after a stop", f"it is sent on in {world.arm_state.value}")
         for segment in path:
             there = world.plane.sensor(segment.to)
