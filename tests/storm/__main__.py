@@ -52,9 +52,10 @@ def main() -> int:
 
 def _play(asked: argparse.Namespace) -> dict[str, Any]:
     from tests.storm.planted import PLANTS
-    from tests.storm.play import play, shrink
+    from tests.storm.play import play, shrink, warm
     from tests.storm.story import draw
 
+    warm()
     if asked.plant:
         PLANTS[asked.plant]()
     seed, began, rig_s = asked.seed, time.monotonic(), 0.0

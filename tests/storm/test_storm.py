@@ -39,14 +39,15 @@ def test_every_kind_of_step_is_drawn() -> None:
 
 
 def test_no_invariant_is_broken() -> None:
-    assert storm("--seed=1", "--stories=8")["failed"] == []
+    assert storm("--seed=1", "--stories=4")["failed"] == []
 
 
 def test_a_seed_is_one_story_with_one_trace() -> None:
-    one, other = (storm("--seed=3") for _ in range(2))
+    one, other = (storm("--seed=2", "--stories=1") for _ in range(2))
     assert one["hashes"] == other["hashes"]
+    assert one["failed"] == []
 
 
 def test_a_planted_defect_is_found() -> None:
-    found = storm("--plant=again_deletes", "--minutes=1", "--no-shrink")
+    found = storm("--plant=retracts_fast", "--stories=1", "--no-shrink")
     assert found["failed"] != []
