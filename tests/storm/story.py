@@ -173,14 +173,14 @@ def _event(rng: random.Random, story: Story, trials: int) -> Step:
         [
             _ask(rng, story, trials),
             _ask(rng, story, trials),
-            {"signal": rng.choice(["SIGINT", "SIGTERM", "SIGHUP", "dropped"])},
+            {"signal": rng.choice(["SIGINT", "SIGTERM", "SIGHUP", "dropped", "dropped"])},
             {"log": {"skin": str(rng.randint(2, 5))}},
             {"log": {}},
             {"clock": rng.choice([-7200, -3, 40, 90_000])},
             {"rival": True},
         ]
     )
-    return {"at_s": round(rng.uniform(0, 250), 2), **made}
+    return {"at_s": round(rng.uniform(0, 130), 2), **made}
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
