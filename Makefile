@@ -10,7 +10,7 @@ INSTALL := $(BIN)/python .ci/install.py
 # what one worker or program has compiled, the others need not
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-core test-programs test-virtual test-realtime test-long lint types imports docs bench clean
+.PHONY: setup demo test test-core test-programs test-virtual test-realtime test-long storm lint types imports docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -62,6 +62,12 @@ test-realtime: $(DONE)
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)
 	$(PYTEST) -m long
+
+# whole campaigns under every fault, in virtual time: hours of the rig, by as many seeds as they need
+HOURS ?= 10
+SEED ?= 1
+storm: $(DONE)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.storm --hours $(HOURS) --seed $(SEED) --jobs 2
 
 lint: types imports
 	$(BIN)/ruff check .

@@ -38,6 +38,7 @@ def join(campaign: Campaign, analysis: Path | None, simulated: bool) -> str:
             text = "has trials that are marked as simulated, or not; choose another campaign"
             raise InputError("simulated", "", simulated, text)
     if analysis is None and begun:
+        campaign.finish_description()
         return load_adapter(campaign.protocol_file).experiment
     text = _text(campaign.name, analysis, simulated)
     adapter = validate(Adapter, parse_yaml(text, analysis or "adapter"), analysis or "adapter")

@@ -208,6 +208,7 @@ class _Imported:
                 raise InputError(
                     "--name", "", campaign.name, "is a collected campaign; choose another name"
                 )
+            campaign.finish_description()
             return
         about = {"from": self.origin.name, "format": self.kind, "when": now()}
         info: CampaignInfo = {"name": campaign.name, "simulated": self.simulated, IMPORTED: about}

@@ -36,6 +36,8 @@ class CampaignTexts:
                 f"has another protocol or rig than {source}; choose another name, and "
                 "import one campaign at a time",
             )
+        else:
+            campaign.finish_description()
 
 
 def check_arrays(data: bytes) -> None:

@@ -232,6 +232,12 @@ class Campaign:
             write_bytes(path, data)
         write_sums(self.folder, tuple(texts))
 
+    def finish_description(self) -> None:
+        """Write the checksums of a description that was written but for them, before a kill."""
+        if self.begun and not (self.folder / CHECKSUMS).exists():
+            texts = (path.read_text("utf-8") for path in (self.protocol_file, self.folder / RIG))
+            self.update(self.info, *texts)
+
     def committed(self) -> set[str]:
         """Return the ids of the committed trials, as far as they are complete."""
         return {path.name for path in self._complete()}

@@ -242,7 +242,7 @@ def _description(store: Store, campaign: Campaign) -> list[StoreProblem]:
     names = (PROTOCOL, RIG, INFO)
     sums: Checksums = {}
     if store.format > 1 and not (folder / CHECKSUMS).exists():
-        what = "is missing; the next `sliplab collect` writes it"
+        what = f"is missing; {_next(campaign)} writes it"
         found.append(problem(folder / CHECKSUMS, what, UNFINISHED))
     elif store.format > 1:
         try:
@@ -265,7 +265,7 @@ def _description(store: Store, campaign: Campaign) -> list[StoreProblem]:
     return found + [
         StoreProblem(item.path, item.what, item.kind, campaign.name)
         for place in (folder, folder / "bench")
-        for item in _temporary(place, campaign.name)
+        for item in _temporary(place, campaign.name, _next(campaign))
     ]
 
 
@@ -278,9 +278,15 @@ def _registered(campaign: Campaign) -> list[StoreProblem]:
     return found + _temporary(campaign.folder / REGISTRATIONS, campaign.name)
 
 
-def _temporary(folder: Path, campaign: str) -> list[StoreProblem]:
-    """Find temporary files of ended programs."""
-    what = "was left by a killed program; the next `sliplab collect` deletes it"
+def _temporary(
+    folder: Path, campaign: str, by: str = "the next `sliplab collect`"
+) -> list[StoreProblem]:
+    """Find temporary files of ended programs.
+
+    Args:
+        by: what deletes them.
+    """
+    what = f"was left by a killed program; {by} deletes it"
     return [
         StoreProblem(str(path), what, UNFINISHED, campaign)
         for path, runs in temporary_files(folder)
@@ -431,6 +437,14 @@ def _frame_problems(data: Path, video: Path, tracks: list[str], counts: dict[str
     return problems
 
 
+def _next(campaign: Campaign) -> str:
+    """Return the program that clears up what a killed one left in a campaign."""
+    with suppress(StoreError):
+        if IMPORTED in campaign.info:
+            return "the same import, or the next recording,"
+    return "the next `sliplab collect`"
+
+
 def _leftovers(store: Store, campaign: Campaign) -> list[StoreProblem]:
     """Find unfinished trials, and quarantined ones without a cause."""
     found = []
@@ -445,9 +459,9 @@ def _leftovers(store: Store, campaign: Campaign) -> list[StoreProblem]:
         elif not path.exists():
             continue  # it was committed meanwhile
         elif (path / RECORD).exists():
-            what, kind = "is not committed yet; the next `sliplab collect` does it", UNFINISHED
+            what, kind = f"is not committed yet; {_next(campaign)} does it", UNFINISHED
         else:
-            what = "is an unfinished trial; the next `sliplab collect` quarantines it"
+            what = f"is an unfinished trial; {_next(campaign)} quarantines it"
             kind = UNFINISHED
         found.append(StoreProblem(str(path), what, kind, campaign.name))
     folder = campaign.folder / "quarantine"

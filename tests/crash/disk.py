@@ -94,9 +94,9 @@ class Disk:
         elif call.kind in {"unlink", "rmdir"}:
             assert node is not None
             self._move(node, call.path, None)
-        elif call.kind == "rename":
+        elif call.kind in {"rename", "link"}:
             assert node is not None
-            self._move(node, call.path, call.to)
+            self._move(node, call.path if call.kind == "rename" else None, call.to)
         else:
             raise AssertionError(f"no such call: {call.kind}")
 
@@ -116,13 +116,19 @@ class Disk:
         if isinstance(node, File):
             node.safe, node.pending = bytearray(node.live), []
             return
-        waiting = []
-        for move in self._moves:
+        waiting: list[Move] = []
+        followed: set[int] = set()
+        for move in reversed(self._moves):
             places = [place[0] for place in (move.out_of, move.into) if place is not None]
-            if any(folder is node for folder in places):
-                _settle(move)
+            # what happened to a node before a flushed change is on the disk as well
+            if any(folder is node for folder in places) or id(move.node) in followed:
+                followed.add(id(move.node))
             else:
-                waiting.append(move)
+                waiting.insert(0, move)
+        kept = {id(move) for move in waiting}
+        for move in self._moves:
+            if id(move) not in kept:
+                _settle(move)
         self._moves = waiting
 
     def seen(self) -> Tree:
@@ -136,8 +142,11 @@ class Disk:
     def torn(self, rng: random.Random) -> Tree:
         """Return the state after a power cut that loses some unflushed data and tears writes."""
         other = copy.deepcopy(self)
+        lost: set[int] = set()  # nodes of which a change is lost, and so all that came after it
         for move in other._moves:
-            if rng.random() < 0.5:
+            if id(move.node) in lost or rng.random() >= 0.5:
+                lost.add(id(move.node))
+            else:
                 _settle(move)
         for file in _files(other._top):
             for call in file.pending:

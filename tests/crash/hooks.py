@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 LIBRARIES = ("python", "libhdf5", "libavformat", "libavutil")
@@ -28,6 +29,8 @@ _SIGNATURES: dict[str, tuple[type, ...]] = {
     "fdatasync": (_INT,),
     "rename": (_PATH, _PATH),
     "renameat": (_INT, _PATH, _INT, _PATH),
+    "link": (_PATH, _PATH),
+    "linkat": (_INT, _PATH, _INT, _PATH, _INT),
     "unlink": (_PATH,),
     "unlinkat": (_INT, _PATH, _INT),
     "mkdir": (_PATH, _INT),
@@ -46,6 +49,7 @@ _KINDS = {
     "openat": "open",
     "fdatasync": "fsync",
     "renameat": "rename",
+    "linkat": "link",
     "unlinkat": "unlink",
     "mkdirat": "mkdir",
     "ftruncate": "truncate",
@@ -59,9 +63,9 @@ class Call:
     """One call that changes a file; `go` makes it, `fail` refuses it.
 
     Attributes:
-        kind: open, write, truncate, fsync, rename, unlink, mkdir or rmdir.
+        kind: open, write, truncate, fsync, rename, link, unlink, mkdir or rmdir.
         path: what it changes, absolute.
-        to: the new name of a rename.
+        to: the new name of a rename or a link.
         flags: of an open.
         offset: where a write begins, bytes.
         size: bytes of a write, or the new length of a truncation.
@@ -165,7 +169,7 @@ def _call(name: str, real: Callable[..., int], arguments: tuple[object, ...]) ->
             call.size = int(arguments[1])  # type: ignore[call-overload]
     elif name.endswith("at"):
         call.path = _path(first, arguments[1])
-        if name == "renameat":
+        if name in {"renameat", "linkat"}:
             call.to = _path(arguments[2], arguments[3])
         elif name == "openat":
             call.flags = int(arguments[2])  # type: ignore[call-overload]
@@ -173,7 +177,7 @@ def _call(name: str, real: Callable[..., int], arguments: tuple[object, ...]) ->
             call.kind = "rmdir"
     else:
         call.path = _path(_AT_FDCWD, first)
-        if name == "rename":
+        if name in {"rename", "link"}:
             call.to = _path(_AT_FDCWD, arguments[1])
         elif name == "open":
             call.flags = int(arguments[1])  # type: ignore[call-overload]
@@ -241,6 +245,17 @@ _STRTAB, _SYMTAB, _RELA, _RELASZ, _PLTRELSZ, _JMPREL = 5, 6, 7, 8, 2, 23
 
 def _patch(hooks: dict[bytes, int | None]) -> int:
     """Point every entry of the names in `hooks` elsewhere; returns how many there were."""
+    patched = 0
+    for place, name in entries():
+        if (hook := hooks.get(name)) is not None:
+            _store(place, hook)
+            patched += 1
+    return patched
+
+
+@cache
+def entries() -> list[tuple[int, bytes]]:
+    """Return the places of all entries and their names; forked processes need not look again."""
     found: list[tuple[int, int]] = []
 
     def visit(item: ctypes._Pointer[_Object], size: int, unused: int | None) -> int:
@@ -255,33 +270,28 @@ def _patch(hooks: dict[bytes, int | None]) -> int:
 
     signature = ctypes.CFUNCTYPE(_INT, ctypes.POINTER(_Object), _SIZE, ctypes.c_void_p)
     _libc.dl_iterate_phdr(signature(visit), None)
-    return sum(_patch_one(base, dynamic, hooks) for base, dynamic in found)
+    return [entry for base, dynamic in found for entry in _entries_of(base, dynamic)]
 
 
-def _patch_one(base: int, dynamic: int, hooks: dict[bytes, int | None]) -> int:
+def _entries_of(base: int, dynamic: int) -> list[tuple[int, bytes]]:
     tags: dict[int, int] = {}
     while (tag := ctypes.c_int64.from_address(dynamic).value) != 0:
         tags[tag] = ctypes.c_uint64.from_address(dynamic + 8).value
         dynamic += 16
     if _STRTAB not in tags or _SYMTAB not in tags:
-        return 0
+        return []
     names, symbols = (_absolute(tags[tag], base) for tag in (_STRTAB, _SYMTAB))
-    patched = 0
+    found = []
     for table, length in ((_JMPREL, _PLTRELSZ), (_RELA, _RELASZ)):
         if table not in tags:
             continue
         count = tags[length] // ctypes.sizeof(_Relocation)
-        entries = (_Relocation * count).from_address(_absolute(tags[table], base))
-        for entry in entries:
+        for entry in (_Relocation * count).from_address(_absolute(tags[table], base)):
             symbol = entry.info >> 32
-            if not symbol:
-                continue
-            at = names + ctypes.c_uint32.from_address(symbols + 24 * symbol).value
-            hook = hooks.get(ctypes.string_at(at))
-            if hook is not None:
-                _store(base + entry.offset, hook)
-                patched += 1
-    return patched
+            if symbol:
+                at = names + ctypes.c_uint32.from_address(symbols + 24 * symbol).value
+                found.append((base + entry.offset, ctypes.string_at(at)))
+    return found
 
 
 def _absolute(address: int, base: int) -> int:

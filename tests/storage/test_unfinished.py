@@ -11,13 +11,16 @@ from typing import Any
 
 import pytest
 
+from sliplab.flows.imports import import_data
 from sliplab.plugins.publish.publication import staged
 from sliplab.storage import files
 from sliplab.storage.files import replacing, scratch_folder, temporary_path, write_bytes, write_text
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import push
 from sliplab.storage.trials.store import Store
-from tests.storage.trial_files import campaign, commit
+from sliplab.storage.trials.verify import verify
+from tests.storage.formats.recordings import write_dsec
+from tests.storage.trial_files import campaign, commit, fill
 
 KILLED = """
 import os, signal, sys
@@ -166,3 +169,23 @@ def test_replacing_keeps_the_file_where_the_block_fails(tmp_path: Path) -> None:
         made.write_text("new")
     assert (tmp_path / "a").read_text() == "new"
     assert names(tmp_path) == {"a"}
+
+
+def test_what_a_killed_import_left_is_cleared_up_by_the_same_import(tmp_path: Path) -> None:
+    """No collection looks into an imported campaign, so `verify` must not refer to one."""
+    file, store = tmp_path / "one.h5", tmp_path / "s"
+    write_dsec(file)
+    import_data(file, store, name="theirs")
+    file = file.rename(tmp_path / "two.h5")
+    theirs = Store.open(store).campaign("theirs")
+    writer = theirs.begin("two", None, 100)
+    fill(writer)
+    writer.abandon()
+    (theirs.folder / "checksums.json").unlink()
+    by = "the same import, or the next recording,"
+    assert [problem.what for problem in verify(Store.open(store))] == [
+        f"is missing; {by} writes it",
+        f"is an unfinished trial; {by} quarantines it",
+    ]
+    assert import_data(file, store, name="theirs")["imported"] == ["two"]
+    assert verify(Store.open(store)) == []

@@ -1,0 +1,176 @@
+"""`python -m tests.storm --seed N`: campaigns under every fault at once, in virtual time.
+
+Stories are played from a seed on: one, or as many as `--stories`, `--hours` of the rig's time or
+`--minutes` on the wall ask for. A failure prints its seed, its invariant, and the shortest story
+that still breaks it. With `--plant` the product has a small defect, which is to be found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+def main() -> int:
+    """Exit code 0 when every invariant held."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.storm",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the first story")
+    parser.add_argument("--stories", type=int, help="how many to play")
+    parser.add_argument("--hours", type=float, help="virtual hours to play")
+    parser.add_argument("--minutes", type=float, help="longest time on the wall")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="processes, each with its share of seeds"
+    )
+    parser.add_argument("--story", type=Path, help="play the story in this file")
+    parser.add_argument("--plant", help="play with a defect of tests/storm/planted.py, or `all`")
+    parser.add_argument("--show", action="store_true", help="print stories and traces")
+    parser.add_argument("--no-shrink", action="store_true", help="leave a failing story long")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    parser.add_argument("--every", type=int, default=1, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if asked.plant == "all":
+        result = _plants(asked)
+    elif asked.jobs > 1:
+        result = _jobs(asked)
+    else:
+        result = _play(asked)
+    print(json.dumps(result) if asked.json else _words(result))
+    return 1 if result["failed"] else 0
+
+
+def _play(asked: argparse.Namespace) -> dict[str, Any]:
+    from tests.storm.planted import PLANTS
+    from tests.storm.play import play, shrink, warm
+    from tests.storm.story import draw
+
+    warm()
+    if asked.plant:
+        PLANTS[asked.plant]()
+    seed, began, rig_s = asked.seed, time.monotonic(), 0.0
+    failed: list[dict[str, Any]] = []
+    hashes: dict[int, str] = {}
+
+    def over() -> bool:
+        if asked.story or (asked.plant and failed):
+            return True
+        reached = [(asked.stories, len(hashes)), (asked.hours, rig_s / 3600)]
+        reached.append((asked.minutes, (time.monotonic() - began) / 60))
+        limits = [have >= wanted for wanted, have in reached if wanted is not None]
+        return any(limits) or not limits
+
+    while True:
+        story = json.loads(asked.story.read_text()) if asked.story else draw(seed)
+        played = play(story)
+        rig_s += played.rig_s
+        hashes[seed] = played.hash
+        if asked.show:
+            print(json.dumps(story), *played.trace, sep="\n", file=sys.stderr)
+        if (wrong := played.wrong) is not None:
+            print(f"seed {seed}: {wrong}", file=sys.stderr, flush=True)
+            short = story if asked.no_shrink else shrink(story, wrong)
+            failed.append({"seed": seed, "wrong": str(wrong), "story": short})
+        seed += asked.every
+        if over():
+            return _result(hashes, failed, rig_s, time.monotonic() - began)
+
+
+def _result(
+    hashes: dict[int, str], failed: list[dict[str, Any]], rig_s: float, took_s: float
+) -> dict[str, Any]:
+    return {
+        "stories": len(hashes),
+        "campaign_hours": round(rig_s / 3600, 3),
+        "minutes": round(took_s / 60, 2),
+        "hours_an_hour": round(rig_s / took_s, 1),
+        "hours_a_processor_hour": round(rig_s / max(_processor_s(), 1e-9), 1),
+        "hashes": hashes,
+        "failed": failed,
+    }
+
+
+def _processor_s() -> float:
+    """Return the processor's time of this process and its children, s."""
+    spent = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in spent)
+
+
+def _words(result: dict[str, Any]) -> str:
+    failed = result["failed"]
+    lines = [
+        f"seed {it['seed']}: {it['wrong']}\n{json.dumps(it['story'])}" for it in result["failed"]
+    ]
+    lines += [f"{name}: {found}" for name, found in result.get("plants", {}).items()]
+    if "stories" in result:
+        lines.append(
+            f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours, "
+            f"{result['hours_an_hour']:.0f} an hour ({result['hours_a_processor_hour']:.0f} of a "
+            f"processor's), {len(failed)} failed"
+        )
+    return "\n".join(lines)
+
+
+def _start(asked: argparse.Namespace, **other: Any) -> subprocess.Popen[str]:
+    options = {
+        "seed": asked.seed,
+        "stories": asked.stories,
+        "hours": asked.hours,
+        "minutes": asked.minutes,
+        **other,
+    }
+    given = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    given += ["--no-shrink"] if asked.no_shrink else []
+    command = [sys.executable, "-m", "tests.storm", "--json", *given]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def _jobs(asked: argparse.Namespace) -> dict[str, Any]:
+    """Play in several processes, each with every so manieth seed."""
+    began = time.monotonic()
+    shares = {
+        name: None if (whole := getattr(asked, name)) is None else whole / asked.jobs
+        for name in ("stories", "hours")
+    }
+    if shares["stories"] is not None:
+        shares["stories"] = -(-asked.stories // asked.jobs)
+    running = [
+        _start(asked, seed=asked.seed + number, every=asked.jobs, **shares)
+        for number in range(asked.jobs)
+    ]
+    parts = [json.loads(each.communicate()[0]) for each in running]
+    hashes = {int(seed): value for part in parts for seed, value in part["hashes"].items()}
+    failed = [it for part in parts for it in part["failed"]]
+    rig_s = 3600 * sum(part["campaign_hours"] for part in parts)
+    return _result(hashes, failed, rig_s, time.monotonic() - began)
+
+
+def _plants(asked: argparse.Namespace) -> dict[str, Any]:
+    """Look for each planted defect by itself; `failed` are those that were not found."""
+    from tests.storm.planted import PLANTS
+
+    asked.no_shrink, found, missed = True, {}, []
+    asked.minutes = asked.minutes or 5.0
+    for name in PLANTS:
+        part = json.loads(_start(asked, plant=name).communicate()[0])
+        seen = part["failed"][0] if part["failed"] else None
+        said = None if seen is None else f"seed {seen['seed']}: {seen['wrong'][:120]}"
+        found[name] = {"stories": part["stories"], "minutes": part["minutes"], "found": said}
+        print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
+        if seen is None:
+            missed.append({"seed": asked.seed, "wrong": f"{name} was not found", "story": None})
+    return {"plants": found, "failed": missed}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

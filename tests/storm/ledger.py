@@ -1,0 +1,303 @@
+"""What must be true of a store, by a record that is kept outside it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliplab.flows.log import log_entries
+from sliplab.flows.status import StatusReader
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
+from sliplab.storage.schema.trial import TrialRecord
+from sliplab.storage.trials import control
+from sliplab.storage.trials.checksums import incomplete
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import content_problems, verify_trial
+from tests.storm.steps import NAME
+
+LATER = {"cause.json"}
+"""Files of an attempt in quarantine that a request may change."""
+DEVICES = {"events": "event_camera", "frames": "frame_camera", "arm": "arm"}
+TIMES = {"95 %": 3.0}
+"""Times its stated uncertainty up to which a clock's error is accepted, by what that states."""
+
+Sums = dict[str, str]
+
+
+class Wrong(Exception):
+    """An invariant does not hold.
+
+    Attributes:
+        invariant: its name. what: how it was broken.
+    """
+
+    def __init__(self, invariant: str, what: str) -> None:
+        super().__init__(f"{invariant}: {what}")
+        self.invariant, self.what = invariant, what
+
+
+class Ledger:
+    """The trials, requests and notes that a store has to keep.
+
+    Args:
+        folder: of the store.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._campaign = folder, folder / "campaigns" / NAME
+        self.trials: dict[str, Sums] = {}
+        self.aside: dict[str, Sums] = {}
+        self.imported: dict[str, Sums] = {}
+        self.files: Sums = {}
+        self.damaged: set[str] = set()
+        self.owed: set[str] = set()
+        self.unfinished: dict[str, Sums] = {}
+        self.counts: Counter[str] = Counter()
+        self.again: Counter[str] = Counter()
+        self.logged: list[str] = []
+        self.asked: dict[int, str] = {}
+        self._known: dict[tuple[Any, ...], str] = {}
+        self._status: StatusReader | None = None
+
+    def look(self, notes: list[dict[str, Any]], ended: bool) -> None:
+        """Hold the store against the record after a step, and record what is new.
+
+        Args:
+            notes: of the step's process.
+            ended: it ended by itself, and not in a kill or a power cut.
+
+        Raises:
+            Wrong: an invariant does not hold.
+        """
+        self._read(notes)
+        if not (self._folder / "store.json").exists():
+            if self.trials or self.files:
+                raise Wrong("nothing committed is lost", "the store is gone")
+            return
+        try:
+            aside = self._folders("quarantine")
+            self._check_aside(aside)
+            self._check_trials(aside)
+            self._check_recorded(notes, ended)
+            self._check_imported(notes)
+            self._check_journals()
+            self._check_status()
+        except (OSError, ValueError, KeyError, StoreError) as error:
+            what = repr(error).replace(str(self._folder), "")
+            raise Wrong("what is kept can be read", what) from error
+
+    def _read(self, notes: list[dict[str, Any]]) -> None:
+        for note in notes:
+            if "wrong" in note:
+                raise Wrong(note["wrong"], note["what"])
+            if note.get("asked") == "again" or note.get("asks") == "again":
+                self.again.update(note["trials"])
+            if "damaged" in note:
+                self.damaged.add(note["damaged"])
+                self._status = None  # one that is kept reads a trial once
+            if "logged" in note:
+                self.logged.append(note["logged"])
+            if "number" in note:
+                self.asked[note["number"]] = note["asked"]
+
+    # -- trials ----------------------------------------------------------------------------
+
+    def _sums(self, folder: Path) -> Sums:
+        return {path.name: self._sum(path) for path in sorted(folder.iterdir())}
+
+    def _sum(self, path: Path) -> str:
+        about = path.stat()
+        key = (path.name, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
+        if key not in self._known:
+            self._known[key] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return self._known[key]
+
+    def _folders(self, name: str) -> dict[str, Sums]:
+        folder = self._campaign / name
+        there = sorted(folder.iterdir()) if folder.is_dir() else []
+        return {path.name: self._sums(path) for path in there}
+
+    def _check_aside(self, aside: dict[str, Sums]) -> None:
+        for name, sums in self.aside.items():
+            if _without(aside.get(name, {})) != _without(sums):
+                raise Wrong("nothing complete is thrown away", f"quarantine/{name} changed or went")
+        for name in aside.keys() - self.aside.keys():
+            cause = self._campaign / "quarantine" / name / "cause.json"
+            if not cause.exists() or not read_json(cause).get("cause"):
+                raise Wrong("a log is true", f"quarantine/{name} has no cause")
+        self.aside = aside
+
+    def _check_trials(self, aside: dict[str, Sums]) -> None:
+        now = self._folders("trials")
+        moving = {name for name, sums in now.items() if "cause.json" in sums}
+        for name, sums in self.trials.items():
+            if now.get(name) == sums or (name in moving and _without(now[name]) == sums):
+                continue
+            kept = any(
+                _without(other) == sums for key, other in aside.items() if key.startswith(name)
+            )
+            if name in self.damaged:
+                continue
+            if not kept:
+                raise Wrong("nothing committed is lost or changed", name)
+            if not self.again[name]:
+                raise Wrong("nothing committed is lost or changed", f"{name}: nobody asked for it")
+        for name in sorted(now.keys() - moving):
+            if self.trials.get(name) == now[name]:
+                continue
+            if name in self.damaged and incomplete(self._campaign / "trials" / name):
+                continue
+            self.damaged.discard(name)
+            self._check_new(name)
+        self.trials = {name: now[name] for name in now.keys() - moving}
+
+    def _check_new(self, name: str) -> None:
+        folder = self._campaign / "trials" / name
+        for problem in verify_trial(folder):
+            raise Wrong("what is committed is whole", f"{name}: {problem.what}")
+        record = Recording(folder).record
+        if not record.simulated or not Campaign(self._campaign).info["simulated"]:
+            raise Wrong("nothing simulated is unmarked", name)
+        for gate, found in record.quality.gates.items():
+            value, limit = found.value, found.limit
+            clock = gate.startswith("sync_uncertainty")
+            if not found.passed or (clock and not float(value or 0) <= float(limit or 0)):
+                raise Wrong("what is committed passed its gates", f"{name}: {gate} = {value}")
+        truth = (record.simulation_truth or {}).get("clocks", {})
+        for device, clock in record.clocks.devices().items():
+            pairs = np.array(truth.get(DEVICES.get(device, device), ()))
+            if not len(pairs) or clock.grade == "host arrival" or clock.uncertainty_ns is None:
+                continue
+            error = np.abs(np.asarray(clock.map.to_reference(pairs[:, 0])) - pairs[:, 1]).max()
+            if error > TIMES.get(clock.kind or "", 1.0) * clock.uncertainty_ns + 1:
+                what = f"{name}: {device} is {error:.0f} ns off, stated {clock.uncertainty_ns:.0f}"
+                raise Wrong("no time is wrong beyond its interval", what)
+
+    def _check_recorded(self, notes: list[dict[str, Any]], ended: bool) -> None:
+        """What was recorded completely is kept; what was not finished is at least set aside."""
+        kept = {*self.trials, *(name.rpartition(".")[0] for name in self.aside)}
+        folder = self._campaign / "incoming"
+        incoming = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        for name, sums in self.unfinished.items():
+            if name in incoming or self._recovered(name, sums):
+                continue
+            causes = self._set_aside(name)
+            if len(causes) <= self.counts[name]:
+                raise Wrong("nothing complete is thrown away", f"incoming/{name} is gone")
+            if name in self.owed and not causes[-1].startswith(("gate", "again")):
+                raise Wrong("nothing complete is thrown away", f"{name} had its record")
+        self.unfinished = {name: self._sums(folder / name) for name in incoming}
+        self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
+        self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
+        for note in notes:
+            if note.get("outcome") == "committed" and note["trial"] not in kept:
+                raise Wrong("nothing committed is lost or changed", f"{note['trial']} was reported")
+            if ended and "recorded" in note and note["recorded"] not in kept | incoming:
+                raise Wrong("nothing complete is thrown away", f"{note['recorded']} was recorded")
+
+    def _recovered(self, name: str, sums: Sums) -> bool:
+        """Return whether a trial was committed with the data that it had unfinished."""
+        return "data.h5" in sums and self.trials.get(name, {}).get("data.h5") == sums["data.h5"]
+
+    def _check_imported(self, notes: list[dict[str, Any]]) -> None:
+        folder = self._folder / "campaigns" / "copied" / "trials"
+        now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
+        reported = {note["imported"] for note in notes if "imported" in note}
+        for name in self.imported.keys() | reported:
+            if name not in now or self.imported.get(name, now[name]) != now[name]:
+                raise Wrong("nothing committed is lost or changed", f"copied/{name}")
+        for name in now.keys() - self.imported.keys():
+            for problem in verify_trial(folder / name):
+                raise Wrong("what is committed is whole", f"copied/{name}: {problem.what}")
+        self.imported = now
+
+    def _set_aside(self, trial: str) -> list[str]:
+        return [
+            str(item["cause"])
+            for item in Campaign(self._campaign).quarantined()
+            if item["trial"] == trial
+        ]
+
+    # -- what people asked for and read -----------------------------------------------------
+
+    def _check_journals(self) -> None:
+        now = {
+            f"{name}/{path.name}": self._sum(path)
+            for name in ("control", "log")
+            if (self._folder / name).is_dir()
+            for path in (self._folder / name).glob("*.json")
+        }
+        for name, known in self.files.items():
+            if now.get(name) != known:
+                raise Wrong("a log is true", f"{name} changed or went")
+        self.files = now
+        store = Store.open(self._folder)
+        faults: list[str] = []
+        entries = log_entries(store, faults)
+        if faults:
+            raise Wrong("a log is true", faults[0].replace(str(self._folder), ""))
+        texts = [entry.text for entry in entries]
+        for text in self.logged:
+            if not any(text in line for line in texts):
+                raise Wrong("a log is true", f"lacks '{text}'")
+        there = {request.number: request.kind for request in control.requests(store)}
+        for number, kind in self.asked.items():
+            if there.get(number) != kind:
+                raise Wrong("a log is true", f"request {number} ({kind}) is {there.get(number)}")
+
+    def _check_status(self) -> None:
+        """What `sliplab status` says is what is on the disk."""
+        if not (self._campaign / "campaign.json").exists():
+            return
+        if self._status is None:
+            self._status = StatusReader(Store.open(self._folder))
+        found = self._status.read()
+        if found.running is not None:
+            raise Wrong("nothing is left open", "the store is still held")
+        (one,) = found.campaigns
+        if one.problem is not None:
+            raise Wrong("a status is true", one.problem.replace(str(self._folder), ""))
+        out = {item["trial"] for item in one.excluded}
+        there = self.trials.keys() - self.damaged
+        counts = (one.committed, one.planned - one.missing - len(out), one.simulated)
+        if counts != (len(there), len(there), True):
+            raise Wrong("a status is true", f"says {counts}, there are {len(there)}")
+        by_person = {item["trial"] for item in one.excluded if item["by"] is not None}
+        skipped = self._skipped() - there
+        if by_person != skipped:
+            what = f"{sorted(by_person)} are skipped, asked and answered were {sorted(skipped)}"
+            raise Wrong("requests are carried out", what)
+
+    def _skipped(self) -> set[str]:
+        """Return the trials that were skipped, by the requests and their answers."""
+        store, found = Store.open(self._folder), set[str]()
+        for request in control.requests(store):
+            did = ((control.answered(store, request) or {}).get("did") or {}).get("trials", {})
+            for trial, text in did.items():
+                if request.kind == "skip" and "set aside" in text:
+                    found.add(trial)
+                elif request.kind == "again":
+                    found.discard(trial)
+        return found
+
+
+def _is_complete(folder: Path) -> bool:
+    """Return whether an unfinished trial has its record, and all that this states."""
+    if not (folder / "record.json").exists() or (folder / "cause.json").exists():
+        return False
+    try:
+        if (folder / "checksums.json").exists():
+            return not verify_trial(folder)
+        return not content_problems(folder, TrialRecord.load(folder / "record.json"))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError):
+        return False
+
+
+def _without(sums: Sums) -> Sums:
+    return {name: value for name, value in sums.items() if name not in LATER}

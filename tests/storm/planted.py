@@ -1,0 +1,290 @@
+"""Small defects of the product, planted one at a time: does the storm find them?
+
+Each is a patch of this process, made before a story is played. What it breaks is its docstring.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from sliplab.analysis import quality
+from sliplab.analysis.clocks import synchronise
+from sliplab.flows import status
+from sliplab.flows.collecting import live_feed, requests, session, supervisor, watches
+from sliplab.rigs.core import guard, motion_watch, rig
+from sliplab.rigs.core.capabilities import ArmState
+from sliplab.storage import files
+from sliplab.storage.remote import objects, pull
+from sliplab.storage.remote import push as pushing
+from sliplab.storage.trials import checksums, control, journal, lock, recovery, store, writer
+
+PLANTS: dict[str, Callable[[], None]] = {}
+
+
+def plant(function: Callable[[], None]) -> Callable[[], None]:
+    """Enter a defect in the table."""
+    PLANTS[function.__name__] = function
+    return function
+
+
+def nothing(*given: Any, **named: Any) -> None:
+    """Do nothing, whatever is given."""
+
+
+# -- store ---------------------------------------------------------------------------------------
+
+
+@plant
+def commit_unflushed() -> None:
+    """The rename that commits a trial is not flushed: a power cut takes the trial back."""
+    for module in (writer, recovery):
+        module.make_visible = lambda folder, target: os.rename(folder, target)  # type: ignore[attr-defined]
+
+
+@plant
+def data_unflushed() -> None:
+    """A trial's data are not flushed before its record is written."""
+    writer.sync_file = nothing  # type: ignore[attr-defined]
+
+
+@plant
+def json_unflushed() -> None:
+    """Small files are replaced without a flush of the new one's bytes."""
+
+    def write(path: Path, blocks: Any, mode: int = 0o666) -> None:
+        temporary = files.temporary_path(path)
+        temporary.write_bytes(b"".join(blocks))
+        os.replace(temporary, path)
+        files.sync_folder(path.parent)
+
+    files.write_blocks = write  # type: ignore[assignment]
+
+
+@plant
+def recovery_trusts() -> None:
+    """Recovery commits whatever has a record, whole or not."""
+    recovery._problems = lambda check: False
+
+
+@plant
+def recovery_gone() -> None:
+    """A complete trial that a kill kept from its commit is set aside as interrupted."""
+    session.recover = lambda campaign: []
+
+
+@plant
+def sweep_deletes() -> None:
+    """What a killed program left is deleted, and not set aside."""
+    sweep = store.Campaign.sweep
+
+    def deleting(campaign: store.Campaign) -> int:
+        for path in campaign.folders("incoming"):
+            shutil.rmtree(path)
+        return sweep(campaign)
+
+    store.Campaign.sweep = deleting  # type: ignore[method-assign]
+
+
+@plant
+def again_deletes() -> None:
+    """A trial that is wanted again is deleted."""
+    quarantine = store.Campaign.quarantine
+
+    def deleting(campaign: store.Campaign, folder: Path, cause: str, **more: object) -> Path:
+        if cause.startswith(store.AGAIN):
+            shutil.rmtree(folder)
+            return folder
+        return quarantine(campaign, folder, cause, **more)
+
+    store.Campaign.quarantine = deleting  # type: ignore[method-assign]
+
+
+@plant
+def journal_reuses() -> None:
+    """The number of a request that comes second replaces the first one's file."""
+
+    def add(self: journal.Journal, number: int, data: Any) -> bool:
+        files.make_folder(self.folder)
+        files.write_json(self.path(max(number - 1, 1)), data)
+        return True
+
+    journal.Journal.add = add  # type: ignore[method-assign]
+
+
+@plant
+def skip_forgets() -> None:
+    """Skipping a trial forgets those that were skipped before."""
+    known, written = control.skipped, control.write_json
+
+    def write(path: Path, data: Any) -> None:
+        last = list(data)[-1:] if path.name == control.SKIPPED else list(data)
+        written(path, {name: data[name] for name in last})
+
+    control.write_json = write  # type: ignore[attr-defined]
+    assert known is control.skipped
+
+
+@plant
+def lock_shared() -> None:
+    """The store's lock does not exclude a second program."""
+    lock._locks = lambda handle, path: True
+    lock._check = nothing  # type: ignore[assignment]
+
+
+@plant
+def left_open() -> None:
+    """A handle of the trials' folder stays open after each commit."""
+    sync_folder = writer.sync_folder
+
+    def leaking(folder: Path) -> None:
+        os.open(folder, os.O_RDONLY)
+        sync_folder(folder)
+
+    writer.sync_folder = leaking  # type: ignore[attr-defined]
+
+
+@plant
+def manifest_first() -> None:
+    """The manifest of a trial is pushed before its files."""
+    send = pushing._Push._send
+
+    def early(self: Any, made: Any, folder: Path, existing: Any) -> bool:
+        self.remote.put(made.key, made.dump())
+        return send(self, made, folder, existing)
+
+    pushing._Push._send = early  # type: ignore[method-assign]
+
+
+@plant
+def pull_unchecked() -> None:
+    """What is pulled becomes visible although files of it are missing."""
+
+    def get(self: objects.Remote, key: str, path: Path, known: Any, stop: Any = None) -> None:
+        try:
+            data = self.read(key)
+        except objects.RemoteError:
+            data = b""
+        files.write_bytes(path, data)
+
+    objects.Remote.get = get  # type: ignore[method-assign]
+    pull.verify_trial = lambda folder: []  # type: ignore[attr-defined]
+
+
+@plant
+def unmarked() -> None:
+    """A simulated trial's record does not say so."""
+    made = session.TrialCollector._record
+    session.TrialCollector._record = lambda self, *given: made(self, *given).model_copy(  # type: ignore[method-assign]
+        update={"simulated": False}
+    )
+
+
+# -- clocks --------------------------------------------------------------------------------------
+
+
+@plant
+def interval_narrow() -> None:
+    """The stated uncertainty of a clock is a twentieth of what it is."""
+    made = synchronise.DeviceSync.record
+    synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
+        replace(self, uncertainty_ns=self.uncertainty_ns / 20)
+    )
+
+
+@plant
+def clock_gate_open() -> None:
+    """The gate of the clocks accepts everything."""
+    found = quality.sync_gate
+    quality.sync_gate = lambda *given: found(*given).model_copy(update={"passed": True})  # type: ignore[assignment]
+
+
+# -- rig and watches -----------------------------------------------------------------------------
+
+
+@plant
+def stop_unheard() -> None:
+    """A stop whose exception was lost is not looked for while the arm moves."""
+    rig.Rig.should_stop = property(lambda self: lambda: False, nothing)  # type: ignore[assignment]
+
+
+@plant
+def retracts_always() -> None:
+    """An arm in a protective stop is sent clear of the plate."""
+    ArmState.healthy = property(lambda self: True)  # type: ignore[assignment,method-assign]
+
+
+@plant
+def retracts_fast() -> None:
+    """The way out of the plate knows no limit of speed."""
+    rig.Rig.at_most = lambda self, speed_mm_s: 20 * speed_mm_s  # type: ignore[method-assign]
+    guard.Guard._speed = nothing  # type: ignore[method-assign]
+
+
+@plant
+def limits_unwatched() -> None:
+    """Poses on the way are not held against the limits."""
+    guard.Guard.check_measured = nothing  # type: ignore[method-assign]
+    motion_watch.MotionWatch.look = nothing  # type: ignore[method-assign]
+
+
+@plant
+def stop_forgotten() -> None:
+    """After a failure the arm is sent clear without a stop before."""
+    rig.Rig._stop_arm = lambda self: None  # type: ignore[method-assign]
+
+
+@plant
+def disk_unwatched() -> None:
+    """A trial begins although the disk has no room for it."""
+    watches.DiskWatch.check = nothing  # type: ignore[method-assign]
+
+
+@plant
+def pause_unheard() -> None:
+    """A paused collection goes on."""
+    supervisor.CollectionSupervisor._wait_while_paused = nothing  # type: ignore[method-assign]
+
+
+@plant
+def pause_keeps_zero() -> None:
+    """After a pause depth zero and warm-up of before are believed."""
+    session.TrialCollector.fresh_start = nothing  # type: ignore[method-assign]
+
+
+@plant
+def feed_stays() -> None:
+    """The thread of the live page does not end with its session."""
+    publish = live_feed.LiveFeed._publish
+
+    def staying(self: live_feed.LiveFeed) -> None:
+        publish(self)
+        live_feed.threading.Event().wait(30)
+
+    live_feed.LiveFeed._publish = staying  # type: ignore[method-assign]
+
+
+# -- what others see -----------------------------------------------------------------------------
+
+
+@plant
+def status_counts_parts() -> None:
+    """The status counts folders that are incomplete."""
+    status.incomplete = lambda folder: None  # type: ignore[attr-defined]
+
+
+@plant
+def answer_early() -> None:
+    """A request is answered without being carried out."""
+    requests.control.skip = lambda where, trials, by: dict.fromkeys(trials, "set aside")  # type: ignore[attr-defined]
+
+
+@plant
+def incomplete_counts() -> None:
+    """A committed trial that lost a file still counts as one."""
+    checksums.incomplete = lambda folder: None  # type: ignore[assignment]
+    store.incomplete = lambda folder: None  # type: ignore[attr-defined]

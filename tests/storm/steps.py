@@ -1,0 +1,343 @@
+"""What the process of one step does: a night at the rig, a request, a push, and so on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sliplab.flows.cli.errors import failure
+from sliplab.flows.collecting import supervisor as supervising
+from sliplab.flows.collecting.requests import ask as ask_for
+from sliplab.flows.collecting.requests import (
+    carry_out,
+    refuse_paused,
+    store_lock,
+)
+from sliplab.flows.collecting.session import open_session, refresh
+from sliplab.flows.collecting.supervisor import SessionListener
+from sliplab.flows.imports import import_data
+from sliplab.flows.log import add_note
+from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.running import stopping
+from sliplab.protocols import Trial
+from sliplab.protocols.errors import InputError
+from sliplab.rigs.core.rig import StopRequested
+from sliplab.storage.errors import StoreError
+from sliplab.storage.remote import pull as pulling
+from sliplab.storage.remote.objects import Remote
+from sliplab.storage.remote.pull import pull
+from sliplab.storage.remote.push import push
+from sliplab.storage.trials import control
+from sliplab.storage.trials.lock import Locked
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.storm.virtual import Host, Notes
+from tests.storm.witness import Witness
+
+NAME = "storm"
+"""Of the campaign."""
+NIGHT_S = 4 * 3600.0
+"""Bound of a night of some trials, pauses of 12 hours apart."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Folders of one story.
+
+    Attributes:
+        folder: of it all; its `data` holds what the weather befalls.
+    """
+
+    folder: Path
+    story: dict[str, Any]
+
+    @property
+    def data(self) -> Path:
+        """Where the store, its copy at a URL, and one that was pulled are."""
+        return self.folder / "data"
+
+    @property
+    def store(self) -> Path:
+        """The store."""
+        return self.data / "store"
+
+    @cached_property
+    def trials(self) -> tuple[str, ...]:
+        """Ids of the planned trials, in their order."""
+        return tuple(trial.id for trial in self.request([]).plan)
+
+    def request(self, faults: list[dict[str, Any]], most: int | None = None) -> RunRequest:
+        """Return the request to collect on a rig with these faults."""
+        rig = {**self.story["rig"]}
+        rig["mock"] = {**rig["mock"], "faults": faults}
+        files = {"protocol.yaml": self.story["protocol"], "rig.yaml": rig}
+        for name, content in files.items():
+            (self.folder / name).write_text(yaml.dump(content, Dumper=yaml.CSafeDumper))
+        return make_request(*(self.folder / name for name in files), self.store, most=most)
+
+
+@dataclass(frozen=True)
+class Process:
+    """The process that carries out a step."""
+
+    stage: Stage
+    host: Host
+    notes: Notes
+
+    def run(self, step: dict[str, Any]) -> None:
+        """Carry out a step as a command does, and note how it ended."""
+        handles, threads = _handles(), threading.active_count()
+        try:
+            with stopping.signals():
+                DO[step["do"]](self, step)
+            self.notes.add(end="done")
+        except (KeyboardInterrupt, StopRequested):
+            self.notes.add(end="stopped")
+        except Exception as error:
+            told = failure(error)
+            if told.trace:
+                self.notes.add(wrong="errors are explained", what=self.scrubbed(repr(error)))
+                raise
+            self.notes.add(end=type(error).__name__, text=self.scrubbed(told.message))
+        left = _handles() - handles
+        if left or threading.active_count() > threads:
+            names = sorted(thread.name for thread in threading.enumerate())
+            what = self.scrubbed(f"{sorted(left)}, threads {names}")
+            self.notes.add(wrong="nothing is left open", what=what)
+
+    def scrubbed(self, text: str) -> str:
+        """Return a text without what differs between two runs of one story."""
+        return text.replace(str(self.stage.folder.resolve()), "").replace(
+            str(self.stage.folder), ""
+        )
+
+
+def _handles() -> set[str]:
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            found.add(f"{name} {os.readlink(f'/proc/self/fd/{name}')}")
+        except OSError:
+            continue  # that of the listing
+    return found
+
+
+# -- a night -------------------------------------------------------------------------------------
+
+
+class _Listener(SessionListener):
+    def __init__(self, notes: Notes, witness: Witness) -> None:
+        self._notes, self._witness = notes, witness
+
+    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+        self._notes.add(trial=trial.id, outcome=outcome)
+
+    def on_paused(self, why: str) -> None:
+        self._notes.add(paused=why.partition(" (")[0])
+
+    def on_resumed(self, seconds: float) -> None:
+        self._notes.add(resumed_s=seconds)
+        self._witness.resumed = True
+
+
+def night(process: Process, step: dict[str, Any]) -> None:
+    """Collect what is missing, while faults, people and weather have their way."""
+    stage, host, notes = process.stage, process.host, process.notes
+    request = stage.request(step.get("faults", []), step.get("most"))
+    planned_s = sum(request.plan.seconds(trial) for trial in request.plan)
+    host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
+    supervising.POLL_S = 300.0  # a pause of 12 hours is looked at less often
+    witness = Witness(request.rig, host, notes)
+    witness.install()
+    host.events = [
+        (event["at_s"], partial(happen, process, event, witness))
+        for event in step.get("events", [])
+    ]
+    store = Store.create(stage.store)
+    refuse_paused(store)
+    if control.open_requests(store):
+        with store_lock(store):
+            carry_out(store)
+    if not request.due_trials(store.campaign(request.campaign)):
+        refresh(request)
+        return
+    with open_session(request, _Listener(notes, witness)) as session, stopping.signals():
+        witness.watch(session.supervisor, request.plan)
+        session.supervisor.wait = partial(_wait, host)
+        session.supervisor.clock = lambda: host.wall_s
+        session.collector.rig.connect()
+        trials = session.trials
+        while trials:
+            session.collector.take(trials)
+            trials = session.more() if step.get("most") is None else []
+
+
+def _wait(host: Host, seconds: float) -> None:
+    stopping.check()
+    host.wait(seconds)
+    stopping.check()
+
+
+def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
+    """Let something happen in the middle of a night."""
+    if "signal" in event:
+        witness.stop_asked()
+        process.notes.add(signal=event["signal"])
+        if event["signal"] == "dropped":  # its exception was lost in a destructor
+            stopping.request()
+        else:
+            os.kill(os.getpid(), getattr(signal, event["signal"]))
+    elif "clock" in event:
+        process.host.wall_s += event["clock"]
+    elif "rival" in event:
+        try:
+            with store_lock(Store.open(process.stage.store)):
+                witness.wrong("one program at a time", "a second one got the store's lock")
+        except Locked:
+            pass
+    else:
+        try:
+            if "log" in event:
+                _log(process, event["log"])
+            else:
+                _file_request(process, event)
+        except (OSError, StoreError, InputError) as error:
+            process.notes.add(refused=type(error).__name__)
+
+
+def _file_request(process: Process, wanted: dict[str, Any]) -> None:
+    store, kind = Store.open(process.stage.store), wanted["ask"]
+    ids = _ids(process, wanted)
+    if ids and not store.campaign(NAME).begun:
+        return
+    made = control.ask(store, kind, who="anna", campaign=NAME if ids else "", trials=ids)
+    process.notes.add(asked=kind, number=made.number, trials=ids)
+
+
+def _ids(process: Process, wanted: dict[str, Any]) -> tuple[str, ...]:
+    every = process.stage.trials
+    return tuple(every[index % len(every)] for index in wanted.get("trials", ()))
+
+
+# -- other steps ---------------------------------------------------------------------------------
+
+
+def ask(process: Process, step: dict[str, Any]) -> None:
+    """Ask for something while no collection runs."""
+    if not Store.exists(process.stage.store):
+        return
+    store, ids = Store.open(process.stage.store), _ids(process, step)
+    if ids and not store.campaign(NAME).begun:
+        return
+    process.notes.add(asks=step["ask"], trials=ids)
+    campaign = NAME if ids else ""
+    with stopping.signals():
+        done = ask_for(store, step["ask"], who="ben", campaign=campaign, trials=ids, limit_s=0)
+    process.notes.add(asked=step["ask"], number=done.request.number, trials=ids)
+    if done.answer is None:
+        process.notes.add(wrong="requests are carried out", what=str(done.as_json()["what"]))
+
+
+def log(process: Process, step: dict[str, Any]) -> None:
+    """Log a skin, or a note."""
+    if Store.exists(process.stage.store):
+        _log(process, step)
+
+
+def _log(process: Process, step: dict[str, Any]) -> None:
+    store = Store.open(process.stage.store)
+    context = {"skin": step["skin"]} if "skin" in step else None
+    text = f"note at {process.host.wall_s:.0f}"
+    if context and not store.campaign(NAME).begun:
+        return
+    add_note(store, text, who="anna", context=context)
+    process.notes.add(logged=text)
+
+
+def check(process: Process, step: dict[str, Any]) -> None:
+    """Verify the store: nothing is damaged."""
+    if Store.exists(process.stage.store):
+        for problem in verify(Store.open(process.stage.store)):
+            if problem.kind == "damaged":
+                what = process.scrubbed(f"{problem.path}: {problem.what}")
+                process.notes.add(found=problem.trial, what=what)
+
+
+def damage(process: Process, step: dict[str, Any]) -> None:
+    """A disk loses the end of a committed trial's data."""
+    folder = process.stage.store / "campaigns" / NAME / "trials"
+    trials = sorted(folder.iterdir()) if folder.is_dir() else []
+    if trials:
+        trial = trials[step["trial"] % len(trials)]
+        process.notes.add(damaged=trial.name)
+        (trial / "data.h5").chmod(0o644)
+        os.truncate(trial / "data.h5", 1000)
+
+
+def bring(process: Process, step: dict[str, Any]) -> None:
+    """Import a recording of another program: here a copy of a trial's own data."""
+    file = process.stage.folder / "one.h5"
+    folder = process.stage.store / "campaigns" / NAME / "trials"
+    if not file.exists():
+        trials = sorted(folder.iterdir()) if folder.is_dir() else []
+        if not trials:
+            return
+        shutil.copy(trials[0] / "data.h5", file)
+    import_data(file, process.stage.store, name="copied", simulated=True)
+    process.notes.add(imported="one")
+
+
+def _remote(process: Process, fails: int) -> Remote:
+    """Return the URL of the copy, which fails at every so manieth object."""
+    folder = process.stage.data / "remote"
+    remote, seen = Remote(f"file://{folder}"), [0]
+
+    def failing(real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **named: Any) -> Any:
+            seen[0] += 1
+            if fails and seen[0] % fails == 0:
+                raise OSError(5, "the network is gone")
+            return real(*given, **named)
+
+        return call
+
+    for name in ("info", "open", "ls", "cat", "pipe_file", "rm_file"):
+        setattr(remote._fs, name, failing(getattr(remote._fs, name)))
+    return remote
+
+
+def send(process: Process, step: dict[str, Any]) -> None:
+    """Push the store."""
+    if Store.exists(process.stage.store):
+        done = push(Store.open(process.stage.store), _remote(process, step["fails"]))
+        process.notes.add(pushed=done.pushed, problems=len(done.problems))
+
+
+def fetch(process: Process, step: dict[str, Any]) -> None:
+    """Pull what was pushed into a store of its own."""
+    if (process.stage.data / "remote").exists():
+        pulling._AT_ONCE = 1  # one after another, in an order that the seed decides
+        done = pull(_remote(process, step["fails"]), process.stage.data / "pulled")
+        process.notes.add(pulled=done.pulled, problems=len(done.problems))
+
+
+DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
+    "night": night,
+    "ask": ask,
+    "log": log,
+    "verify": check,
+    "damage": damage,
+    "import": bring,
+    "push": send,
+    "pull": fetch,
+}
+"""What each kind of step does."""

@@ -1,0 +1,233 @@
+"""Stories: what happens to one campaign, as a list of steps that JSON can hold, drawn from a seed.
+
+A step is ``{"do": KIND, ...}``. `WEATHER` of a step is what befalls its process: a kill at one of
+its writes, a power cut, a full, failing or read-only disk. Every draw comes from the seed.
+"""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from tests.conftest import ROOT
+from tests.crash.campaign import protocol
+
+Story = dict[str, Any]
+Step = dict[str, Any]
+Draw = Callable[[random.Random], dict[str, Any]]
+
+DEVICES = ("arm", "event_camera", "frame_camera", "sync_box")
+
+
+def _device(rng: random.Random, *but: str) -> dict[str, Any]:
+    return {"device": rng.choice([name for name in DEVICES if name not in but])}
+
+
+FAULTS: dict[str, Draw] = {
+    "arm_protective_stop": lambda rng: {},
+    "arm_off_path": lambda rng: {"mm": rng.choice([0.3, 3, 10]), "seconds": rng.choice([0.3, 2])},
+    "frames_lost": lambda rng: {"count": rng.choice([1, 5])},
+    "frame_late": lambda rng: {"seconds": rng.choice([0.05, 0.5])},
+    "event_gap": lambda rng: {"seconds": rng.choice([0.02, 0.3])},
+    "event_stall": lambda rng: {"seconds": rng.choice([0.1, 1])},
+    "event_burst": lambda rng: {"seconds": 0.02},
+    "clock_drift": lambda rng: {**_device(rng), "ppm": rng.choice([-20, 20, 200, 2000])},
+    "clock_jump": lambda rng: {**_device(rng), "seconds": rng.choice([-5000, -0.01, 0.003, 0.25])},
+    "clock_restart": lambda rng: _device(rng, "sync_box"),
+    "pulses_lost": lambda rng: {"count": rng.choice([1, 5, 50]), **_device(rng, "frame_camera")},
+    "pulses_duplicated": lambda rng: {"count": 5, **_device(rng, "frame_camera")},
+    "pulses_late": lambda rng: {"count": rng.choice([1, 30]), **_device(rng, "frame_camera")},
+    "papilla_torn": lambda rng: {"papilla": rng.choice([0, 5])},
+    "marker_occluded": lambda rng: {"papilla": 0},
+    "plate_stuck": lambda rng: {},
+    "papilla_sticky": lambda rng: {"papilla": 3},
+    "skin_wear": lambda rng: {},
+    "plate_spot": lambda rng: {"centre_mm": [2, 1], "radius_mm": 2},
+    "mains_light": lambda rng: {"share": 0.08},
+    "knock": lambda rng: {},
+    "shaking": lambda rng: {},
+    "event_noise": lambda rng: {},
+    "skin_brushed": lambda rng: {},
+    "arm_ramp": lambda rng: {"mm_s2": rng.choice([1, 20])},
+    "disk_full": lambda rng: {},
+    "device_gone": lambda rng: {**_device(rng), **rng.choice([{}, {"seconds": 0.3}])},
+    "stream_gone": lambda rng: {"stream": "warm"},
+}
+"""Parameters of each kind of `rigs.core.faults` that a rig file may name."""
+CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
+"""Calls of a night that change a file, by kind: powers of two."""
+WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
+ALONE = {"mains_light", "arm_ramp"}
+"""Kinds of which a trial has one at most."""
+
+
+def draw(seed: int) -> Story:
+    """Return the story of a seed."""
+    rng = random.Random(seed)
+    story = {"seed": seed, "protocol": _protocol(rng), "rig": _rig(rng)}
+    trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
+    kinds = [*STEPS]
+    steps = []
+    for number in range(rng.randint(4, 8)):
+        kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
+        steps.append({"do": kind, **STEPS[kind][1](rng, story, trials)})
+    return {**story, "steps": steps}
+
+
+def _protocol(rng: random.Random) -> dict[str, Any]:
+    data = protocol(rng.randint(3, 6))
+    data["name"] = "storm"
+    collection = data["collection"]
+    collection["seed"] = rng.randrange(10_000)
+    factors = collection["factors"]
+    factors["depth"]["values"] = [rng.choice([2.0, 2.4, 3.2])]
+    factors["speed"]["values"] = [rng.choice([0.4, 0.4, 1.6, 4.0])]
+    collection["motion"][3]["distance"] = f"{rng.choice([1.6, 4, 8])} mm"
+    settle, hold = rng.choice([0.2, 10]), rng.choice([0.5, 5])
+    collection["motion"][2] |= {"settle": f"{settle} s", "duration": f"{hold} s"}
+    collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0036 ms"])
+    collection["gates"]["retakes"] = rng.choice([0, 2])
+    warm_up = {"presses": 2, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
+    rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
+    both = {"warm_up": warm_up, "rezero": rezero}
+    collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
+    return data
+
+
+def _rig(rng: random.Random) -> dict[str, Any]:
+    rig: dict[str, Any] = {
+        "extends": str(ROOT / "rigs" / "rehearsal.yaml"),
+        "name": "storm",
+        "mock": {"seed": rng.randrange(1000)},
+        "poll": rng.choice(["0.5 s", "1 s", "1 s", "1 s"]),
+        # close around the motion, so that leaving the path is leaving the limits
+        "limits": {"depth": "3.4 mm", "speed": "50 mm/s", "reach": "9 mm"},
+    }
+    if rng.random() < 0.3:
+        delay = {"shortest_us": 0, "longest_us": 4000}
+        rig["timing"] = {"force": {"grade": "host time", "delay": delay}}
+        rig["mock"]["force"] = {"rate_hz": 500}
+        if rng.random() < 0.5:
+            rig["limits"]["force"] = "12 N"
+    if rng.random() < 0.3:
+        thermometer = {"kind": "scalar", "unit": "degC", "mock": {"rate_hz": 20}}
+        thermometer["timing"] = {"delay": {"shortest_us": 0, "longest_us": 4000}}
+        rig["streams"] = {"warm": thermometer}
+    return rig
+
+
+# -- steps ---------------------------------------------------------------------------------------
+
+
+def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
+    """Draw none to three faults of a night."""
+    found: list[dict[str, Any]] = []
+    for _ in range(rng.choice([0, 0, 1, 1, 2, 3])):
+        kind = rng.choice([*FAULTS])
+        if kind in ALONE and any(fault["kind"] == kind for fault in found):
+            continue
+        if kind == "stream_gone" and "streams" not in story["rig"]:
+            continue
+        fault = {"kind": kind, **FAULTS[kind](rng)}
+        if rng.random() < 0.8:
+            fault["trial"] = rng.randint(1, 6)
+        if kind not in WHOLE_TRIALS:
+            fault["at_s"] = round(rng.uniform(0, 4), 2)
+        if kind not in WHOLE_TRIALS and rng.random() < 0.3:
+            fault["since"] = "trial"
+        found.append(fault)
+    return found
+
+
+def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
+    if rng.random() > share:
+        return {}
+    kind = rng.choice([*CALLS])
+    kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
+    cut = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
+    full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
+    drawn: list[Step] = [
+        {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
+        {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
+        {"full": full},
+        {"low": {"free": rng.choice([0, 150_000_000])}},
+        {"read_only": {}},
+    ]
+    made = rng.choices(drawn, [4, 4, 2, 1, 1])[0]
+    return {"weather": made}
+
+
+def _ask(rng: random.Random, story: Story, trials: int) -> Step:
+    """Draw what an operator asks for."""
+    made: Step = {"ask": rng.choice(["pause", "resume", "stop", "skip", "again", "again"])}
+    if made["ask"] in {"skip", "again"}:
+        made["trials"] = [rng.randrange(trials)]
+    return made
+
+
+def _event(rng: random.Random, story: Story, trials: int) -> Step:
+    """Draw what happens at some time of a night."""
+    made = rng.choice(
+        [
+            _ask(rng, story, trials),
+            _ask(rng, story, trials),
+            {"signal": rng.choice(["SIGINT", "SIGTERM", "SIGHUP", "dropped", "dropped"])},
+            {"log": {"skin": str(rng.randint(2, 5))}},
+            {"log": {}},
+            {"clock": rng.choice([-7200, -3, 40, 90_000])},
+            {"rival": True},
+        ]
+    )
+    return {"at_s": round(rng.uniform(0, 130), 2), **made}
+
+
+def _night(rng: random.Random, story: Story, trials: int) -> Step:
+    events = [_event(rng, story, trials) for _ in range(rng.choice([0, 1, 2, 3]))]
+    return {
+        "faults": _faults(rng, story),
+        "events": sorted(events, key=lambda event: event["at_s"]),
+        "most": rng.choice([None, None, 2]),
+        **_weather(rng),
+    }
+
+
+def _between(rng: random.Random, story: Story, trials: int) -> Step:
+    return {**_ask(rng, story, trials), **_weather(rng, 0.2)}
+
+
+STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
+    "night": (5, _night),
+    "ask": (2, _between),
+    "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
+    "verify": (0.5, lambda rng, story, trials: {}),
+    "damage": (0.3, lambda rng, story, trials: {"trial": rng.randrange(trials)}),
+    "import": (0.5, lambda rng, story, trials: _weather(rng)),
+    "push": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
+    "pull": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
+}
+"""Kinds of steps: how often they are drawn, and what draws their particulars."""
+
+
+def shorter(story: Story) -> Iterator[Story]:
+    """Yield stories that lack one part of this one, the largest parts first."""
+    for index in range(len(story["steps"])):
+        made = copy.deepcopy(story)
+        del made["steps"][index]
+        yield made
+    for index, step in enumerate(story["steps"]):
+        for key in ("faults", "events"):
+            for part in range(len(step.get(key, ()))):
+                made = copy.deepcopy(story)
+                del made["steps"][index][key][part]
+                yield made
+        if "weather" in step:
+            made = copy.deepcopy(story)
+            del made["steps"][index]["weather"]
+            yield made
+    directions = story["protocol"]["collection"]["factors"]["direction"]["values"]
+    if len(directions) > 2:
+        made = copy.deepcopy(story)
+        del made["protocol"]["collection"]["factors"]["direction"]["values"][-1]
+        yield made
