@@ -120,7 +120,7 @@ class Papillae(Detector):
         self._place = np.full(self._shape[0] * self._shape[1], -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
-        self._touched = np.zeros(1, np.int64)
+        self._age = np.zeros(2, np.int64)
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
@@ -197,7 +197,7 @@ class Papillae(Detector):
         scale = self._dispersion() ** 2
         fewest = self.settings.fewest_places
         rest, pushed = self._rest, self._pushed
-        _advance(counts, self._noise, rest, pushed, self._touched, scale, fewest, value)
+        _advance(counts, self._noise, rest, pushed, self._age, scale, fewest, value)
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""
@@ -308,7 +308,7 @@ def _advance(
     noise: F64,
     rest: F64,
     pushed: F64,
-    touched: I64,
+    age: I64,
     scale: float,
     fewest: int,
     value: F64,
@@ -318,7 +318,8 @@ def _advance(
     Args:
         counts: as of `_counts`. noise: events a millisecond of each place.
         rest, pushed: statistics, which are changed. scale: square of the dispersion.
-        touched: milliseconds for which an object still counts as touching; changed, shape (1,).
+        age: changed, shape (2,): milliseconds for which an object still counts as touching, and
+            since enough places move. In the first ones all cause more events than before.
         fewest: places that must move. value: of each millisecond.
     """
     places = len(rest)
@@ -331,6 +332,7 @@ def _advance(
         if moving.sum() < fewest or not others.any():
             rest[:] = 0.0
             pushed[:] = 0.0
+            age[1] = 0
         else:
             all_n, all_w = n[others].sum(), memory[others].sum()
             weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
@@ -347,8 +349,11 @@ def _advance(
                 rest[j] = _page(rest[j], silent, seen, all_seen, share)
                 moved = _page(pushed[j], DISTURBED, seen, all_seen, min(share, MOST / DISTURBED))
                 pushed[j] = min(moved, LARGEST)
-            touched[0] = TOUCHED_MS if pushed.max() >= TOUCHED else max(touched[0] - 1, 0)
-            most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if touched[0] > 0 else 1.0))
+            age[1] += 1
+            if age[1] < MEMORY_MS:
+                pushed[:] = 0.0
+            age[0] = TOUCHED_MS if pushed.max() >= TOUCHED else max(age[0] - 1, 0)
+            most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if age[0] > 0 else 1.0))
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]
 
