@@ -102,7 +102,7 @@ def brushed(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def jolted(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Markers move slowly; for 60 ms a knock shakes each of them in its own way, ten times faster."""
+    """Markers move slowly; for 60 ms a knock shakes each in its own way, ten times faster."""
     phase = 2.4 * np.arange(len(CENTRES))
     own = 0.5 + 0.5 * np.sin(2 * np.pi * 60 * t[:, None] + phase)
     knock = (t > SLIP_S) & (t < SLIP_S + 0.06)
