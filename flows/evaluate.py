@@ -43,6 +43,7 @@ class PromisedDetector(TypedDict):
     """
 
     detector: str
+    simulated: bool
     level: float | None
     promised: bool
     says: str
@@ -114,6 +115,7 @@ def _promises(job: EvaluationJob, promise: float) -> list[PromisedDetector]:
         rows.append(
             PromisedDetector(
                 detector=row.found.rule.name,
+                simulated=job.store.simulated,
                 level=level.value if np.isfinite(level.value) else None,
                 promised=level.promised,
                 says=level.words,

@@ -155,7 +155,7 @@ def unsupported(asked: float, found: AlarmRate) -> str:
     """Return why recorded time cannot promise a rate, 1/h, and how much would."""
     high = "no rate" if found.high is None else f"it at {found.high:.3g} an hour"
     return (
-        f"{asked:g} false alarms an hour cannot be promised: {found.hours:.3g} h without slip "
+        f"a rate of {asked:g} an hour cannot be promised: {found.hours:.3g} h without slip "
         f"bound {high}; it takes {needed_hours(asked):.3g} h without an alarm"
     )
 

@@ -152,7 +152,7 @@ def evaluate(
         promise=promise,
     )
     if promise is not None and not as_json:
-        _show_promises(done.pop("promise"), f"detectors at the promise, {store}")
+        _show_promises(done.pop("promise"), store)
     if as_json or (model is None and predictions is None):
         finish(done, f"evaluate {store}", as_json)
         return
@@ -164,7 +164,7 @@ def evaluate(
     console.print_pairs(f"{scores['model']} on {store}{simulated}", _model_scores(scores))
 
 
-def _show_promises(rows: list[PromisedDetector], title: str) -> None:
+def _show_promises(rows: list[PromisedDetector], store: str) -> None:
     """Print detectors at the levels that a promise set."""
     from sliplab.analysis.report.page import number
 
@@ -183,7 +183,8 @@ def _show_promises(rows: list[PromisedDetector], title: str) -> None:
         ]
         for row in rows
     ]
-    console.print_table(title, columns, table)
+    simulated = " (simulated)" if any(row["simulated"] for row in rows) else ""
+    console.print_table(f"detectors at the promise, {store}{simulated}", columns, table)
     for says in dict.fromkeys(row["says"] for row in rows if not row["promised"]):
         console.say(says)
 

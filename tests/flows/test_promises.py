@@ -52,7 +52,7 @@ def test_evaluate_says_that_two_trials_promise_nothing(store: Store) -> None:
         assert not row["promised"]
         assert row["validation"]["alarms"] == 0
         assert row["validation"]["hours"] < 0.01
-        assert row["says"].startswith("1 false alarms an hour cannot be promised: ")
+        assert row["says"].startswith("a rate of 1 an hour cannot be promised: ")
         assert row["says"].endswith("it takes 3.69 h without an alarm")
     assert "promise" not in run_evaluation(store.folder, None)
 
@@ -67,6 +67,7 @@ def test_the_command_shows_it(store: Store) -> None:
     done = here("evaluate", store.folder, "--promise", "1")
     assert done.returncode == 0
     assert "hmm counts" in done.stdout
+    assert "(simulated)" in done.stdout
     assert done.stderr.count("cannot be promised") == 1
     wrong = here("evaluate", store.folder, "--model", "x.pt", "--promise", "1", "--json")
     assert json.loads(wrong.stdout)["error"]["key"] == "--promise"

@@ -97,7 +97,7 @@ def test_a_rate_that_the_hours_cannot_show_is_not_promised() -> None:
     assert not one.promised, "half an hour without an alarm allows 7 an hour"
     assert one.found.alarms == 0
     assert one.words == (
-        "1 false alarms an hour cannot be promised: 0.5 h without slip bound it at 7.38 an hour; "
+        "a rate of 1 an hour cannot be promised: 0.5 h without slip bound it at 7.38 an hour; "
         "it takes 3.69 h without an alarm"
     )
     assert more.promised
