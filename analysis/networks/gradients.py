@@ -279,7 +279,7 @@ def on_device(net: nn.Sequential, gain: float, device: str) -> OnDevice:
 
 @dataclass(frozen=True)
 class HeldWindows:
-    """Windows whose cells lie on a device: a batch is scattered there, and nothing is copied."""
+    """Windows held on a device, so that batches are scattered there without copies."""
 
     windows: SparseWindows
     begin: torch.Tensor

@@ -147,7 +147,7 @@ class Ledger:
             if not kept:
                 raise Wrong("nothing committed is lost or changed", name)
             if not self.again[name]:
-                raise Wrong("nothing committed is lost or changed", f"{name}: nobody asked for it")
+                raise Wrong("nothing committed is lost or changed", f"{name}: no request for it")
         for name in sorted(now.keys() - moving):
             if self.trials.get(name) == now[name]:
                 continue

@@ -1,4 +1,4 @@
-"""Plays a story: each step in a process of its own, which kills, cuts and full disks may end."""
+"""Plays a story: one process for each step, which kills, power cuts and full disks may end."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _but_locks(policy: Policy) -> Policy:
 
 
 class Player:
-    """Plays one story in a folder of its own."""
+    """Plays one story in its own folder."""
 
     def __init__(self, folder: Path, story: Story) -> None:
         self._stage = Stage(folder, story)

@@ -103,11 +103,11 @@ class Process:
         except (KeyboardInterrupt, StopRequested):
             self.notes.add(end="stopped")
         except Exception as error:
-            told = failure(error)
-            if told.trace:
+            failed = failure(error)
+            if failed.trace:
                 self.notes.add(wrong="errors are explained", what=self.scrubbed(repr(error)))
                 raise
-            self.notes.add(end=type(error).__name__, text=self.scrubbed(told.message))
+            self.notes.add(end=type(error).__name__, text=self.scrubbed(failed.message))
         left = _handles() - handles
         if left or threading.active_count() > threads:
             names = sorted(thread.name for thread in threading.enumerate())
@@ -323,7 +323,7 @@ def send(process: Process, step: dict[str, Any]) -> None:
 
 
 def fetch(process: Process, step: dict[str, Any]) -> None:
-    """Pull what was pushed into a store of its own."""
+    """Pull what was pushed into another store."""
     if (process.stage.data / "remote").exists():
         pulling._AT_ONCE = 1  # one after another, in an order that the seed decides
         done = pull(_remote(process, step["fails"]), process.stage.data / "pulled")
