@@ -9,6 +9,7 @@ import typer
 
 from sliplab.flows.cli.common import DATA, JsonOption, finish
 from sliplab.flows.running import console, exit_codes
+from sliplab.protocols.errors import InputError
 
 app = typer.Typer()
 
@@ -66,6 +67,9 @@ def align_(
     from sliplab.plugins.align.align import AlignmentRefused, align
     from sliplab.plugins.align.events import events_from
 
+    for given in (a, b, times):
+        if out is not None and given is not None and Path(out).resolve() == Path(given).resolve():
+            raise InputError("--out", "", str(out), "is read, too; name another file")
     try:
         found = align(
             a,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import subprocess
@@ -16,6 +17,34 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+
+
+def count(text: str) -> int:
+    """Read a number of at least 1."""
+    if (value := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
+    return value
+
+
+def amount(text: str) -> float:
+    """Read a finite number above 0."""
+    if not 0 < (value := float(text)) < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0")
+    return value
+
+
+def story_file(text: str) -> dict[str, Any]:
+    """Read a story that a failure printed."""
+    from tests.storm.story import draw
+
+    try:
+        found: dict[str, Any] = json.loads(Path(text).read_text())
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"{text}: {error}") from None
+    lacking = {*draw(1)} - ({*found} if isinstance(found, dict) else set())
+    if lacking:
+        raise argparse.ArgumentTypeError(f"{text}: no story, it lacks {', '.join(sorted(lacking))}")
+    return found
 
 
 def main() -> int:
@@ -26,20 +55,25 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--seed", type=int, default=1, help="of the first story")
-    parser.add_argument("--stories", type=int, help="how many to play")
-    parser.add_argument("--hours", type=float, help="virtual hours to play")
-    parser.add_argument("--minutes", type=float, help="longest time on the wall")
+    parser.add_argument("--stories", type=count, help="how many to play")
+    parser.add_argument("--hours", type=amount, help="virtual hours to play")
+    parser.add_argument("--minutes", type=amount, help="longest time on the wall")
     parser.add_argument(
-        "--jobs", type=int, default=1, help="processes, each with its share of seeds"
+        "--jobs", type=count, default=1, help="processes, each with its share of seeds"
     )
-    parser.add_argument("--story", type=Path, help="play the story in this file")
+    parser.add_argument("--story", type=story_file, help="play the story in this file")
     parser.add_argument("--plant", help="play with a defect of tests/storm/planted.py, or `all`")
     parser.add_argument("--show", action="store_true", help="print stories and traces")
     parser.add_argument("--no-shrink", action="store_true", help="leave a failing story long")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--every", type=int, default=1, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    asked = parser.parse_args()
+    if asked.plant is not None:
+        from tests.storm.planted import PLANTS
+
+        if asked.plant not in ("all", *PLANTS):
+            parser.error(f"--plant {asked.plant}: must be all, or one of {', '.join(PLANTS)}")
     if asked.plant == "all":
         result = _plants(asked)
     elif asked.jobs > 1:
@@ -71,7 +105,7 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
         return any(limits) or not limits
 
     while True:
-        story = json.loads(asked.story.read_text()) if asked.story else draw(seed)
+        story = asked.story or draw(seed)
         played = play(story)
         rig_s += played.rig_s
         hashes[seed] = played.hash

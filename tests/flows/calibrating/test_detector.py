@@ -147,6 +147,12 @@ def test_a_skin_that_was_not_seen_writes_nothing(
         ({"version": 99}, "version = 99: must be 1"),
         ({"level": "high"}, "level"),
         ({"format": 2}, "newer version"),
+        ({"level": 1e9}, "level = .*: must be 12, of hold and unload"),
+        ({"level": -5.0}, "level = -5"),
+        ({"hot": [4800]}, "hot = .*must be from 0 to 4799"),
+        ({"places": []}, "places = 0: some must have moved"),
+        ({"fewest_places": 0}, "fewest_places = 0"),
+        ({"cell_px": 0}, "cell_px = 0"),
     ],
 )
 def test_a_document_of_another_kind_is_refused(
@@ -154,6 +160,23 @@ def test_a_document_of_another_kind_is_refused(
 ) -> None:
     other = tmp_path / "other.json"
     write_json(other, {**read_json(document), **change})
+    with pytest.raises(InputError, match=says):
+        load_calibration(other)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"high": 0.001}, "hold.high = 0.001: so many hours without an alarm show "),
+        ({"hours": 1e9, "high": 3.7e-9}, "hold.hours = 1000000000.*at most 10.1"),
+        ({"hours": 0.0}, "hold.hours = 0"),
+    ],
+)
+def test_a_promise_that_the_hold_does_not_show_is_refused(
+    document: Path, tmp_path: Path, change: dict[str, float], says: str
+) -> None:
+    other, found = tmp_path / "other.json", read_json(document)
+    write_json(other, {**found, "hold": {**found["hold"], **change}})
     with pytest.raises(InputError, match=says):
         load_calibration(other)
 

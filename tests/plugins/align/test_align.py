@@ -247,3 +247,14 @@ def test_a_clock_that_jumps_every_few_events_is_refused_or_right(seed: int) -> N
     half = (mapped.high_ns - mapped.low_ns) / 2
     off = np.abs(mapped.ns - np.rint(1e9 * b))
     assert (off <= 3 * half)[mapped.within].all()
+
+
+@pytest.mark.parametrize("name", ["a.csv", "b.csv"])
+def test_a_file_that_is_read_is_not_written_over(tmp_path: Path, name: str) -> None:
+    for file in ("a.csv", "b.csv"):
+        (tmp_path / file).write_text("t\n" + "\n".join(map(str, _random_events(60))))
+    before = (tmp_path / name).read_bytes()
+    said = here("align", tmp_path / "a.csv", tmp_path / "b.csv", "--out", tmp_path / name)
+    assert said.returncode == 2
+    assert "name another file" in said.stderr
+    assert (tmp_path / name).read_bytes() == before
