@@ -7,5 +7,5 @@ from sliplab.protocols.plugin import Plugin
 _COMMAND = "sliplab.plugins.deploy.command"
 PLUGIN = Plugin(
     commands={"export-model": f"{_COMMAND}:app"},
-    exports={"onnx": f"{_COMMAND}:ONNX", "card": f"{_COMMAND}:CARD"},
+    exports={"onnx": f"{_COMMAND}:ONNX", "card": f"{_COMMAND}:CARD", "nir": f"{_COMMAND}:NIR"},
 )

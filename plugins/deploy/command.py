@@ -75,8 +75,21 @@ def write(request: ExportRequest) -> ExportResult:
     return ExportResult(f"exported to {out}{simulated}", result, _model_pairs(result))
 
 
+def refuse_nir(_request: ExportRequest) -> ExportResult:
+    """NIR (Pedersen et al., 2024) has no neuron like these. Raises InputError: always."""
+    raise InputError(
+        "--as",
+        "",
+        "nir",
+        "cannot hold this network: NIR's integrate-and-fire neuron subtracts its threshold after "
+        "a spike, and the network's is reset to zero, so nearly every window would count "
+        "otherwise (docs/models.md). --as onnx holds the neurons as they are",
+    )
+
+
 CARD = Export("model", write, frozenset({"store", "campaign"}))
 ONNX = Export("model", write, CARD.options | {"windows"})
+NIR = Export("model", refuse_nir)
 
 
 def _model_pairs(result: ExportedModel) -> dict[str, object]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sinabs.activation import MembraneSubtract
 from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
@@ -27,10 +29,12 @@ from sliplab.analysis.networks.network import (
 )
 from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quantise, quantised_net
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
+from sliplab.flows.exports import ExportRequest, export
 from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
 from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
 from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.plugins.deploy.speck import CORES, KI, speck_fit
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
@@ -82,6 +86,17 @@ def test_a_graph_of_other_classes_and_taxels(classes: int) -> None:
     assert check_onnx(data, net, x) == 6
     assert onnx_counts(data, x).shape == (6, classes)
     assert onnx_counts(data, x[:0]).shape == (0, classes)
+
+
+def test_nir_is_refused_since_its_neurons_count_otherwise(tmp_path: Path) -> None:
+    x = sparse(50, FULL, 1, 0.1)
+    net = biased(build(NetworkSettings(), FULL, 1), 1)
+    ours = spike_counts(net, x)
+    for name in SPIKING:
+        getattr(net, name).reset_fn = MembraneSubtract()
+    assert (spike_counts(net, x) != ours).any(axis=1).mean() > 0.9
+    with pytest.raises(InputError, match=r"nir: cannot hold .* --as onnx"):
+        export(ExportRequest("seed0.pt", "", "nir", tmp_path))
 
 
 def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:

@@ -60,7 +60,7 @@ def test_mcap_files_are_published_and_imported_again(tmp_path: Path) -> None:
     [
         (
             ("--as", "word"),
-            "--as = word: must be one of aedat4, dsec, labels, samples, onnx, card",
+            "--as = word: must be one of aedat4, dsec, labels, samples, onnx, card, nir",
         ),
         (("--as", "croissant", "--campaign", "x"), "--campaign = x: must be a campaign of"),
         (("--as", "croissant", "--licence", "free"), "--licence = free: must be one of CC0-1.0"),
