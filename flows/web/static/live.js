@@ -18,19 +18,30 @@ for (const kind of ["now", "status"]) on(kind, (text) => {
 });
 on("problem", (text) => { place("problem").textContent = text; });
 
+// on a canvas, since a browser keeps hundreds of the pictures that an <img> has shown
+async function draw(canvas, jpeg) {
+  const bytes = Uint8Array.from(atob(jpeg), (letter) => letter.charCodeAt(0));
+  const picture = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+  if (canvas.width !== picture.width || canvas.height !== picture.height)
+    [canvas.width, canvas.height] = [picture.width, picture.height];
+  canvas.getContext("2d").drawImage(picture, 0, 0);
+  picture.close();
+}
+
 on("pictures", (text) => {
   const found = JSON.parse(text), parent = place("pictures"), names = Object.keys(found);
-  if (names.join() !== [...parent.querySelectorAll("img")].map((image) => image.dataset.name).join())
+  if (names.join() !== [...parent.querySelectorAll("canvas")].map((canvas) => canvas.dataset.name).join())
     parent.replaceChildren(...names.map((name) => {
-      const figure = document.createElement("figure"), image = document.createElement("img");
-      image.dataset.name = name;
-      image.alt = `last picture of ${name}`;
+      const figure = document.createElement("figure"), canvas = document.createElement("canvas");
+      canvas.dataset.name = name;
+      canvas.role = "img";
+      canvas.ariaLabel = `last picture of ${name}`;
       const caption = document.createElement("figcaption");
       caption.textContent = name;
-      figure.append(image, caption);
+      figure.append(canvas, caption);
       return figure;
     }));
-  for (const image of parent.querySelectorAll("img")) image.src = `data:image/jpeg;base64,${found[image.dataset.name]}`;
+  for (const canvas of parent.querySelectorAll("canvas")) draw(canvas, found[canvas.dataset.name]);
 });
 
 on("curves", (text) => {

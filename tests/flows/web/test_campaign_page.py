@@ -82,12 +82,20 @@ class Person:
         expect(self.tab.locator(place, has_text=text).first).to_be_visible(timeout=LIMIT_MS)
 
 
+DRAWN = """() => [...document.querySelectorAll("#pictures canvas")].every((canvas) => {
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  return canvas.width > 100 && new Set(data).size > 2;
+})"""
+"""Each camera has a picture of several brightnesses."""
+
+
 def drive(browser: Any, link: str, folder: Path, protocol: str, planned: int) -> None:
     """Do what the first line says."""
     anna = Person(browser, link, "Anna")
     anna.start(protocol, TRIALS, "first night")
     anna.tab.wait_for_selector("#now .phase")
-    anna.tab.wait_for_selector("#pictures img")
+    anna.tab.wait_for_selector("#pictures canvas")
+    anna.tab.wait_for_function(DRAWN)
     anna.act("Pause", "Pause after this trial", Reason="lens dirty")
     anna.sees("#status .notice", "Anna")
     anna.sees("#now .line", "paused before")
