@@ -782,6 +782,13 @@ class StreamReader:
         values = self._rows(name).read()
         return values.astype(np.int64) if name == TIMES else values
 
+    def column_parts(self, name: str) -> Iterator[Array]:
+        """Yield a column, `EVENTS_AT_ONCE` of its rows at a time; times are int64."""
+        rows = self._rows(name)
+        for low in range(0, len(rows), EVENTS_AT_ONCE):
+            values = rows.read(low, min(low + EVENTS_AT_ONCE, len(rows)))
+            yield values.astype(np.int64) if name == TIMES else values
+
     def has(self, name: str) -> bool:
         """Return whether the file has a column of this name; some of `TRACKS` and `TIMING` have."""
         return self._file.has(name)

@@ -312,7 +312,7 @@ def content_problems(folder: Path, record: TrialRecord) -> Found:
         made = [name for name in TIMING if reader.has(name)]
         tracks = [name for name in TRACKS if reader.has(name)]
         for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t", *made):
-            if np.any(np.diff(reader.column(name)) < 0):
+            if runs_backwards(reader, name):
                 problems.append((folder / DATA, f"{name} runs backwards"))
         problems += _data_problems(folder / DATA, reader, counts, record.geometry.event_px)
         problems += _stream_problems(folder, reader, record)
@@ -347,14 +347,36 @@ def _data_problems(
         if len(set(lengths.values())) > 1:
             problems.append((path, f"{group} has columns of different lengths: {lengths}"))
     for name, most in zip("xy", size_px or (), strict=False):
-        last = int(reader.column(f"events/{name}").max(initial=0))
+        parts = reader.column_parts(f"events/{name}")
+        last = max((int(part.max()) for part in parts), default=0)
         if counts["events/t"] and last >= most:
             problems.append((path, f"events/{name} has {last}, the camera has {most} px"))
-    marks = reader.column(INDEX)
-    after = np.arange(len(marks)) * 1000 + reader.t_offset_us
-    if not np.array_equal(marks, np.searchsorted(reader.event_times(), after)):
+    if not leads_to_events(reader):
         problems.append((path, f"{INDEX} does not lead to the events"))
     return problems
+
+
+def runs_backwards(reader: StreamReader, name: str) -> bool:
+    """Return whether a column of times falls anywhere; one part at a time is in memory."""
+    last: np.generic | None = None
+    for part in reader.column_parts(name):
+        if (last is not None and part[0] < last) or np.any(part[1:] < part[:-1]):
+            return True
+        last = part[-1]
+    return False
+
+
+def leads_to_events(reader: StreamReader) -> bool:
+    """Return whether the index has the first event at or after each millisecond."""
+    marks = reader.column(INDEX)
+    after = np.arange(len(marks)) * 1000
+    done = before = 0  # milliseconds that were looked at; events of earlier parts
+    for times in reader.column_parts("events/t"):
+        end = done + int(np.searchsorted(after[done:], times[-1], "right"))
+        if not np.array_equal(marks[done:end], before + np.searchsorted(times, after[done:end])):
+            return False
+        done, before = end, before + len(times)
+    return bool(np.all(marks[done:] == before))
 
 
 def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) -> Found:
@@ -381,7 +403,7 @@ def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) ->
             for part, count in counts[name].items()
             if count != given.rows
         ]
-        if np.any(np.diff(reader.column(f"{path}/t")) < 0):
+        if runs_backwards(reader, f"{path}/t"):
             problems.append((folder / DATA, f"{path}/t runs backwards"))
     return problems
 
@@ -408,7 +430,7 @@ def _camera_problems(folder: Path, record: TrialRecord) -> Found:
             problems += [
                 (data, f"{column} runs backwards")
                 for column in ("events/t", "event_pulses/t", "frames/t")
-                if np.any(np.diff(reader.column(column)) < 0)
+                if runs_backwards(reader, column)
             ]
             pixels = given.size_px if given.kind == EVENTS_KIND else None
             problems += _data_problems(data, reader, counts, pixels)
