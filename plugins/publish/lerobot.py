@@ -46,6 +46,8 @@ _CHUNK = 1000
 """Files of a folder."""
 _SAMPLES = 32
 """Frames of a trial that are decoded for the statistics of levels."""
+_SAMPLE_PX = 150
+"""Rows or columns of such a frame that are enough, as LeRobot has it."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _PLAIN = {
     "timestamp": "float32",
@@ -389,6 +391,8 @@ def _frame_video(made: _Set, recording: Recording, shown: I64) -> None:
     with recording.frame_reader() as reader:
         for number in shown[:: max(len(shown) // _SAMPLES, 1)].tolist():
             image = reader.frame(number)
+            step = max(min(image.shape) // _SAMPLE_PX, 1)
+            image = image[::step, ::step]
             levels.add(np.bincount(image.reshape(-1), minlength=256)[None], 1)
 
 
