@@ -19,7 +19,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml, read_text, validate
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY, read_rig, shipped_rigs
-from sliplab.storage.files import write_text
+from sliplab.storage.files import write_bytes, write_text
 
 _WIDEST = 1 << 20
 """Line width, so large that no line is folded."""
@@ -92,7 +92,7 @@ def write_entries(
         text = source.text  # in another folder, `extends` would not find its file
     new = edited(text, changes, remove)
     _check(rig, target, new)
-    retained = _keep(target, today) if target.exists() else None
+    retained = keep_old(target, today)
     write_text(target, new)
     return Written(target, retained)
 
@@ -179,16 +179,18 @@ def _check(rig: Path, target: Path, text: str) -> None:
         draft.unlink(missing_ok=True)
 
 
-def _keep(path: Path, today: date) -> Path:
-    """Copy `path` to a file next to it that is named after the day."""
-    number, text = 1, read_text(path, "rig file")
+def keep_old(path: Path, today: date) -> Path | None:
+    """Copy `path`, if it exists, to a file next to it that is named after the day; return that."""
+    if not path.exists():
+        return None
+    number, data = 1, path.read_bytes()
     while True:
         more = f"-{number}" if number > 1 else ""
         copy = path.with_name(f"{path.stem}.before-{today.isoformat()}{more}{path.suffix}")
         if not copy.exists():
             break
         number += 1
-    write_text(copy, text)
+    write_bytes(copy, data)
     return copy
 
 

@@ -18,7 +18,7 @@ from sliplab.rigs import build
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
 from sliplab.rigs.core.teaching import APPROACH_MM_S
-from sliplab.rigs.rig_edit import writable_target, write_entries
+from sliplab.rigs.rig_edit import keep_old, writable_target, write_entries
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path
 from sliplab.rigs.rig_lock import held
@@ -157,18 +157,20 @@ class Measurement:
         yes: bool,
         dry_run: bool,
         measure: Callable[[CalibrationSession], D],
-    ) -> D | None:
+    ) -> tuple[D, Path | None] | None:
         """Run a measurement whose result is a document beside the rig file, as `run`.
 
         Returns:
-            the document, which was written to `target`; None in a dry run.
+            the document, which was written to `target`, and the copy of the file that was there;
+            None in a dry run.
         """
         if dry_run:
             self._print_moves(moves, "")
             return None
-        made, _ = self.measured(moves, yes, measure)
+        made, today = self.measured(moves, yes, measure)
+        retained = keep_old(target, today)
         write_json(target, made.to_json())
-        return made
+        return made, retained
 
     def measured(
         self,

@@ -443,21 +443,25 @@ def calibrate_detector(
     motion = steps.SkinMotion(depth, hold, rub, speed)
     motion.check(command.file)
     target = steps.document_target(command.file, out)
-    made = command.write_document(
+    done = command.write_document(
         target,
         motion.moves,
         yes,
         dry_run,
         lambda session: steps.calibrate_detector(session, motion),
     )
-    if made is None:
+    if done is None:
         return
+    made, retained = done
     if as_json:
-        console.print_json({**made.to_json(), "written": str(target)})
+        kept = retained and str(retained)
+        console.print_json({**made.to_json(), "written": str(target), "kept": kept})
         return
     simulated = " (simulated)" if made.simulated else ""
     console.print_pairs(f"detector of rig {made.rig}{simulated}", steps.shown(made))
     console.say(f"written to {target}; use it as `sliplab detect --model {target.name}`")
+    if retained is not None:
+        console.say(f"the old file is kept as {retained}")
 
 
 @calibrate_app.command("board", epilog="Example: sliplab calibrate board --out board.pdf")

@@ -39,6 +39,7 @@ Bools = NDArray[np.bool_]
 
 MAX_DRIFT_PPM = 500.0
 """Largest difference of two clocks' rates that is searched, by default."""
+MOST_DRIFT_PPM = 50_000.0
 _MOST_OUTSIDE = 0.4
 """Largest share of a stretch's pairs that may lie off its line."""
 _BETWEEN = 8
@@ -253,7 +254,7 @@ def align(
         AlignmentRefused: no map can be trusted; `reason` is a word for it.
         InputError: an argument or a file that cannot be right.
     """
-    if not 0 < max_drift_ppm <= 50_000:
+    if not 0 < max_drift_ppm <= MOST_DRIFT_PPM:
         raise InputError("align", "max_drift_ppm", max_drift_ppm, "must be in (0, 50000]")
     if not (0 < within_s < 1e6 and (offset_s is None or abs(offset_s) < 4e9)):
         raise InputError("align", "within_s", within_s, "must be positive, offset_s a time in s")
@@ -271,7 +272,9 @@ def align(
                 f"{events.name} has {plural(events.ns.size, 'event')}; at least {MIN_KNOWN} are "
                 f"needed with ids or an offset, {MIN_EVENTS} without",
             )
-    return _Fit(first, second, max_drift_ppm * 1e-6).align(offset_s, within_s)
+        if not np.ptp(events.ns):
+            raise events.error(0, f"is the time of all {events.ns.size} events")
+    return _Fit(first, second, max_drift_ppm * 1e-6, offset_s).align(within_s)
 
 
 @dataclass(frozen=True)
@@ -288,40 +291,65 @@ class _Part:
 class _Fit:
     """Both lists as floats near 0, in pieces within which their times rise."""
 
-    def __init__(self, a: Events, b: Events, max_drift: float) -> None:
-        self.a, self.b, self.max_drift = a, b, max_drift
+    def __init__(self, a: Events, b: Events, max_drift: float, offset_s: float | None) -> None:
+        self.a, self.b, self.max_drift, self.offset_s = a, b, max_drift, offset_s
         self.origin_a, self.origin_b = int(np.median(a.ns)), int(np.median(b.ns))
         self.unit = float(max(a.unit_ns, b.unit_ns))
         self.floor = max(0.3 * self.unit, 0.5)
         self.x, self.pieces_a, order_a = _rising(a.ns, self.origin_a)
         self.y, self.pieces_b, order_b = _rising(b.ns, self.origin_b)
+        known = offset_s is not None or (a.ids is not None and b.ids is not None)
+        for events, pieces in ((a, self.pieces_a), (b, self.pieces_b)):
+            if len(pieces) > 2 and max(np.diff(pieces)) < (MIN_KNOWN if known else MIN_EVENTS):
+                raise _not_in_order(events, pieces)
         self.ids_a = None if a.ids is None else a.ids[order_a]
         self.ids_b = None if b.ids is None else b.ids[order_b]
 
-    def align(self, offset_s: float | None, within_s: float) -> Alignment:
+    def align(self, within_s: float) -> Alignment:
         try:
             if self.ids_a is not None and self.ids_b is not None:
                 by, runs = "ids", self._by_ids(self.ids_a, self.ids_b)
-            elif offset_s is not None:
-                by, runs = "offset", self._by_offset(offset_s, within_s)
+            elif self.offset_s is not None:
+                by, runs = "offset", self._by_offset(self.offset_s, within_s)
             else:
                 by, runs = "pattern", self._by_pattern()
         except NoMatchError as error:
-            hint = "; or give an approximate offset" if error.reason == "ambiguous" else ""
-            raise AlignmentRefused(error.reason, f"{error}{hint}") from None
+            raise AlignmentRefused(error.reason, f"{error}{self._hints(error.reason)}") from None
         least = MIN_EVENTS if by == "pattern" else MIN_KNOWN
         parts = [
             part for piece, run in self._merged(runs) for part in self._split(piece, run, least)
         ]
         steep = [part for part in parts if abs(part.state.rate) > self.max_drift]
         if steep or not parts:
-            found = f"{1e6 * steep[0].state.rate:.0f} ppm" if steep else "no straight stretch"
-            raise AlignmentRefused(
-                "no_match",
-                f"the clocks differ by {found}; at most {1e6 * self.max_drift:g} ppm are allowed: "
-                "raise it, or check that both saw the same events",
-            )
+            raise AlignmentRefused("no_match", self._no_clock(steep, by) + self._hints("no_match"))
         return self._finished(parts, by)
+
+    def _no_clock(self, steep: list[_Part], by: str) -> str:
+        if not steep:
+            return "the pairs lie on no straight line: check that both saw the same events"
+        ppm = 1e6 * steep[0].state.rate
+        if abs(ppm) > MOST_DRIFT_PPM:
+            what = "ids" if by == "ids" else "times"
+            return (
+                f"paired by {by}, the clocks differ by {ppm:.0f} ppm, as no two clocks do: check "
+                f"that the {what} of both mean the same, in the same order"
+            )
+        return (
+            f"the clocks differ by {ppm:.0f} ppm; at most {1e6 * self.max_drift:g} ppm are "
+            "allowed: raise it, or check that both saw the same events"
+        )
+
+    def _hints(self, reason: str) -> str:
+        """Return further likely causes of a refusal."""
+        found = ["or give an approximate offset"] if reason == "ambiguous" else []
+        for events, pieces in ((self.a, self.pieces_a), (self.b, self.pieces_b)):
+            if len(pieces) > 2:
+                found.append(str(_not_in_order(events, pieces)))
+        steps = [float(np.median(np.abs(np.diff(events.ns)))) for events in (self.a, self.b)]
+        power = 3 * round(float(np.log10(steps[0] / steps[1])) / 3) if min(steps) > 0 else 0
+        if power and 0.5 < steps[0] / steps[1] / 10.0**power < 2:
+            found.append(f"intervals of A are about 1e{power} times those of B: check the units")
+        return "".join(f"; {hint}" for hint in found)
 
     def _by_ids(self, ids_a: Ints, ids_b: Ints) -> list[tuple[int, Run]]:
         once_a, once_b = _unique(ids_a), _unique(ids_b)
@@ -332,7 +360,8 @@ class _Fit:
         if i.size < MIN_KNOWN:
             raise NoMatchError(
                 "too_few_pulses",
-                f"{plural(i.size, 'id')} in both lists; at least {MIN_KNOWN} are needed",
+                f"{plural(i.size, 'id')} in both lists, once in each; at least {MIN_KNOWN} are "
+                "needed",
             )
         found = []
         for piece, (begin, end) in enumerate(pairwise(self.pieces_a)):
@@ -580,6 +609,14 @@ def _rising(ns: Ints, origin: int) -> tuple[Floats, list[int], Ints]:
         [begin + np.argsort(ns[begin:end], kind="stable") for begin, end in pairwise(edges)]
     )
     return (ns[order] - origin).astype(np.float64), edges, order
+
+
+def _not_in_order(events: Events, pieces: list[int]) -> InputError:
+    """Return the error of a list that falls back at the beginning of each of its pieces."""
+    k, falls = pieces[1], len(pieces) - 2
+    before = f"is earlier than the event before ({events.ns[k - 1] / 1e9:.9g} s)"
+    more = f", as {plural(falls - 1, 'other')}" if falls > 1 else ""
+    return events.error(k, f"{before}{more}: not in order; sort the events by time")
 
 
 def _unique(ids: Ints) -> Ints:

@@ -67,28 +67,32 @@ def align_(
     from sliplab.plugins.align.align import AlignmentRefused, align
     from sliplab.plugins.align.events import events_from
 
+    if times is not None and out is None:
+        raise InputError("--map", "", str(times), "needs --out, the file to write")
+    if out is not None and not out.parent.is_dir():
+        raise InputError("--out", "", str(out), "its folder does not exist")
     for given in (a, b, times):
         if out is not None and given is not None and Path(out).resolve() == Path(given).resolve():
             raise InputError("--out", "", str(out), "is read, too; name another file")
+    first = events_from(a, "a", unit, harp=harp)
+    second = b if b == "harp" else events_from(b, "b", unit, harp=harp)
     try:
         found = align(
-            a,
-            b,
+            first,
+            second,
             offset_s=offset,
             within_s=within,
             max_drift_ppm=drift,
-            unit=unit,
-            harp=harp,
         )
     except AlignmentRefused as refusal:
         if as_json:
             console.print_json({"refused": refusal.reason, "message": str(refusal)})
         console.say(f"refused: {refusal.reason}: {refusal}")
         raise typer.Exit(exit_codes.FAILED) from None
-    result = found.to_json()
+    columns = {"a": first.column, "b": second if isinstance(second, str) else second.column}
+    result = {"columns": columns, **found.to_json()}
     if out is not None:
-        # Harp words among A's edges are its events, not the edges
-        asked = events_from(times or a, "times", unit, harp=harp and times is None).ns
+        asked = (first if times is None else events_from(times, "times", unit)).ns
         mapped = found.map(asked)
         mapped.write(asked, out)
         result |= {"written": str(out), "times": asked.size, "unknown": int((~mapped.known).sum())}
@@ -98,6 +102,7 @@ def align_(
 def _pairs(result: dict[str, Any]) -> dict[str, Any]:
     shown: dict[str, Any] = {
         "paired by": result["paired_by"],
+        "columns": " and ".join(result["columns"].values()),
         "events": f"{result['events_a']} and {result['events_b']}",
     }
     for number, part in enumerate(result["stretches"], 1):

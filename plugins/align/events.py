@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass
+import codecs
+import re
+import unicodedata
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from os import PathLike
 from pathlib import Path
@@ -12,14 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
+from sliplab.storage.formats.tables import MOST_TABLE, TableRow, exact_ns, rows_of_csv
 
 Ints = NDArray[np.int64]
 
-UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_TIMES = ("t", "time", "times", "timestamp", "timestamps")
+_TIMES = ("t", "time", "times", "timestamp", "timestamps", "onset")
 _IDS = ("id", "code", "barcode")
 _LEVELS = ("state", "level")
+_UNIT = re.compile(r"(.+?)[ _(\[/]+(ns|us|μs|ms|s)[)\]]?")
+"""A heading that ends in a unit: ``time_ms``, ``Time [ms]``, ``t (µs)``."""
+_MOST_NS = 2**62
 HARP_BAUD = 1000.0
 """Bits a second of the slow copy of a Harp clock that acquisition systems record."""
 _WORD = 40
@@ -34,12 +40,21 @@ class Events:
         name: where they come from, for messages.
         ns: (n,) int64.
         ids: (n,) int64, what tells an event from others, or None.
+        column: of the file that has the times, with its unit; empty without a file.
+        rows: (n,) int64 lines of the file, or None without one.
         unit_ns: the unit to which the times are cut, as far as they show it.
     """
 
     name: str
     ns: Ints
     ids: Ints | None = None
+    column: str = ""
+    rows: Ints | None = None
+
+    def error(self, k: int, expected: str) -> InputError:
+        """Return the error of one event's time."""
+        place = f"[{k}]" if self.rows is None else f"row {self.rows[k]}"
+        return InputError(self.name, place, f"{self.ns[k] / 1e9:.9g} s", expected)
 
     @property
     def unit_ns(self) -> int:
@@ -54,19 +69,22 @@ def events_from(source: Any, name: str, unit: str | None = None, *, harp: bool =
     """Events of a file or an array.
 
     Args:
-        source: a CSV file with a column of times (named ``t`` or ``time`` with an optional unit, as
-            ``time_ms``; else the first column) and perhaps one of ids (``id``, ``code`` or
-            ``barcode``) or levels (``state`` or ``level``: rising edges count); or (n,) times,
-            floats in s or integers in ns; or a pair of times and ids.
+        source: events; a CSV file; or (n,) times, floats in s or integers in ns; or a pair of times
+            and ids. A file has a column of times, named ``t`` or ``time`` with an optional unit, as
+            ``time_ms``, or the only one, or the only one with a unit; and perhaps one of ids
+            (``id``, ``code`` or ``barcode``) or levels (``state`` or ``level``: rising edges
+            count).
         name: for messages about an array.
-        unit: of the times, one of `UNITS`; by default as named in the file, else s.
+        unit: of the times, s, ms, us or ns; by default as named in the file, else s.
         harp: the edges spell a Harp clock's seconds: each word is an event whose id is its second.
 
     Raises:
         InputError: times or ids that cannot be read.
     """
-    if unit is not None and unit not in UNITS:
-        raise InputError(name, "unit", unit, f"must be one of {', '.join(UNITS)}")
+    if unit is not None and unit not in TIME_UNITS:
+        raise InputError(name, "unit", unit, "must be one of s, ms, us, ns")
+    if isinstance(source, Events):
+        return source
     if isinstance(source, str | PathLike):
         return _from_csv(Path(source), unit, harp)
     times, ids = source if isinstance(source, tuple) and len(source) == 2 else (source, None)
@@ -91,67 +109,113 @@ def _ns_of(times: ArrayLike, name: str, unit: str | None) -> Ints:
         if not np.isfinite(array).all():
             bad = int(np.flatnonzero(~np.isfinite(array))[0])
             raise InputError(name, f"[{bad}]", float(array[bad]), "must be a finite time")
-        scaled = array.astype(np.longdouble) * UNITS[unit or "s"]
-        if scaled.size and np.abs(scaled).max() >= 2**62:
+        scaled = array.astype(np.longdouble) * TIME_UNITS[unit or "s"]
+        if scaled.size and np.abs(scaled).max() >= _MOST_NS:
             raise InputError(name, "", None, "has times too large for int64 ns: check their unit")
         result: Ints = np.rint(scaled).astype(np.int64)
         return result
-    return array.astype(np.int64) * UNITS[unit or "ns"]
+    return array.astype(np.int64) * TIME_UNITS[unit or "ns"]
 
 
 def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
     name = str(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(name, "", None, f"cannot be read as CSV: {error}") from None
+    lines = _text(path).splitlines()
+    # a comment keeps its line, so that rows are counted as an editor counts them
+    lines = ["" if line.startswith("#") else line for line in lines]
+    first = next((line for line in lines if line.strip()), "")
+    heading = ["t"] if _is_number(first.strip(' "')) else None
+    columns, rows = rows_of_csv(name, "\n".join(lines), heading)
+    time, named = _time_column(name, columns)
     if not rows:
-        raise InputError(name, "", None, "holds no times")
-    columns = [cell.strip().lower() for cell in rows[0]]
-    header = not _is_number(columns[0])
-    if header:
-        rows = rows[1:]
-    else:
-        columns = ["t", *(f"column {k + 1}" for k in range(1, len(columns)))]
-    time, named = _time_column(columns)
-    scale = UNITS[unit or named or "s"]
-    ns = np.array([_number(name, k, row, time, scale) for k, row in enumerate(rows)], np.int64)
-    ids = _column(name, rows, columns, _IDS)
-    levels = _column(name, rows, columns, _LEVELS)
+        raise InputError(name, "", None, f"is empty below its heading {', '.join(columns)}")
+    unit = unit or named or "s"
+    levels = _column(columns, _LEVELS)
+    if harp and levels is None:
+        raise InputError(name, "", None, f"needs a column {' or '.join(_LEVELS)} of edges")
+    high = np.array([levels is None or _level(row, levels) for row in rows])
     if harp:
-        if levels is None:
-            raise InputError(name, "", None, f"needs a column {' or '.join(_LEVELS)} of edges")
-        return harp_words(name, ns, levels > 0)
-    if levels is not None:
-        ns, ids = ns[levels > 0], None if ids is None else ids[levels > 0]
-    return Events(name, ns, ids)
+        edges = np.array([_time_ns(row, time, unit) for row in rows])
+        return replace(harp_words(name, edges, high), column=f"{time} ({unit})")
+    rows = [row for row, rises in zip(rows, high.tolist(), strict=True) if rises]
+    if not rows:
+        raise InputError(name, str(levels), None, "is 0 in every row; events are where it is 1")
+    ids = _column(columns, _IDS)
+    return Events(
+        name,
+        np.array([_time_ns(row, time, unit) for row in rows]),
+        None if ids is None else np.array([_id(row, ids) for row in rows]),
+        f"{time} ({unit})",
+        np.array([row.number for row in rows]),
+    )
 
 
-def _time_column(columns: list[str]) -> tuple[int, str | None]:
-    for k, column in enumerate(columns):
-        stem, _, unit = column.replace(" ", "_").replace("(", "").replace(")", "").rpartition("_")
-        if column in _TIMES:
-            return k, None
-        if stem in _TIMES and unit in UNITS:
-            return k, unit
-    return 0, None
+def _text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_TABLE + 1)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    if len(data) > MOST_TABLE:
+        text = f"is larger than {MOST_TABLE >> 20} MiB: give only the events that both clocks saw"
+        raise InputError(path, "", None, text)
+    if data.startswith((b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
+        raise InputError(path, "", None, "is a workbook or compressed: save it as CSV, unpacked")
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"byte {error.start}", None, "is not UTF-8 text") from None
+    if "\0" in text:
+        raise InputError(path, f"byte {text.index(chr(0))}", None, "is no text")
+    return text
 
 
-def _column(
-    name: str, rows: list[list[str]], columns: list[str], wanted: tuple[str, ...]
-) -> Ints | None:
-    for k, column in enumerate(columns):
-        if column in wanted:
-            return np.array([_number(name, n, row, k, 1) for n, row in enumerate(rows)], np.int64)
-    return None
+def _time_column(name: str, columns: list[str]) -> tuple[str, str | None]:
+    """Return the column of times, and the unit that it names."""
+    found: dict[str, str | None] = {}
+    known = []
+    for column in columns:
+        plain = unicodedata.normalize("NFKC", column).lower()
+        match = _UNIT.fullmatch(plain)
+        stem, unit = (match[1], match[2].replace("μ", "u")) if match else (plain, None)
+        if stem in _TIMES:
+            known.append(column)
+        if unit is not None or stem in _TIMES or len(columns) == 1:
+            found[column] = unit
+    if len(found) != 1 and not known:
+        text = "name the column of times t or time, with its unit: time_ms"
+        raise InputError(name, "heading", ", ".join(columns), text)
+    time = next(iter(known or found))
+    return time, found[time]
 
 
-def _number(name: str, index: int, row: list[str], column: int, scale: int) -> int:
-    text = row[column].strip() if column < len(row) else ""
-    if not _is_number(text) or abs(Decimal(text)) * scale >= 2**62:
-        raise InputError(name, f"row {index + 1}", text, "must be a number that fits int64 ns")
-    return int((Decimal(text) * scale).to_integral_value())
+def _column(columns: list[str], wanted: tuple[str, ...]) -> str | None:
+    return next((column for column in columns if column.lower() in wanted), None)
+
+
+def _time_ns(row: TableRow, column: str, unit: str) -> int:
+    text = row.values.get(column, "")
+    found = exact_ns(text, unit)
+    if found is not None and abs(found) < _MOST_NS:
+        return found
+    if _is_number(text):
+        right = f"is no time in {unit}: name the unit by --unit, or in the heading: time_ms"
+        raise row.error(column, right)
+    raise row.error(column, f"must be a time in {unit}: a number, with a decimal point")
+
+
+def _id(row: TableRow, column: str) -> int:
+    text = row.values.get(column, "")
+    if not (_is_number(text) and Decimal(text) % 1 == 0 and abs(Decimal(text)) < 2**63):
+        raise row.error(column, "must be a whole number")
+    return int(Decimal(text))
+
+
+def _level(row: TableRow, column: str) -> bool:
+    text = row.values.get(column, "")
+    if not _is_number(text):
+        raise row.error(column, "must be 0 or 1")
+    return Decimal(text) > 0
 
 
 def _is_number(text: str) -> bool:

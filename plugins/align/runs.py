@@ -38,6 +38,11 @@ _GATE = 6.0
 _EVIDENCE = 14.0
 """Log-likelihood ratio at which a stretch ends."""
 _SHIFTS = 32
+_REFUSALS = {
+    "ambiguous": "the lists fit in more than one place, as regular pulses do: check that both saw "
+    "the same events, and send a code or random intervals",
+    "too_few_pulses": f"no {MIN_EVENTS} events of A come as close together as those of B",
+}
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,11 @@ def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> lis
 
 
 def _one_run(x: Floats, y: Floats, max_drift: float, floor: float) -> Run:
-    match = match_trains(x, y, tick_of(np.rint(y).astype(np.int64)), 1.02 * max_drift, None)
+    tick = tick_of(np.rint(y).astype(np.int64))
+    try:
+        match = match_trains(x, y, tick, 1.02 * max_drift, None)
+    except NoMatchError as error:  # it speaks of a sync line
+        raise NoMatchError(error.reason, _REFUSALS.get(error.reason, str(error))) from None
     if match.device.size < MIN_EVENTS:
         raise NoMatchError("no_match", f"only {match.device.size} events match")
     begin, end = _best_window(x, y, match.device, match.reference, MIN_EVENTS, floor)

@@ -94,6 +94,8 @@ def _labelled(publication: Publication) -> Iterator[tuple[str, Recording, TrialL
 
 
 def _onsets(campaign: str, recording: Recording, label: TrialLabel) -> Iterator[Json]:
+    if label.spans and all(label.at_ns(kind) is None for kind in KINDS):
+        return  # came with classes: nothing is known of its onsets
     for kind in KINDS:
         at_ns = label.at_ns(kind)
         low_ns, high_ns, what = None, None, None

@@ -4,20 +4,19 @@ Rows have the times of a grid; the true ones are features of their own: ``time_n
 ``frame_time_ns`` of the frame that a row has.
 
 Layout: ``meta/info.json``, ``meta/stats.json``, ``meta/tasks.parquet``, ``meta/episodes/`` and
-``data/``, all Parquet of chunk-NNN/file-NNN. A row covers 1/100 s of the trial's time line and has
-the values known at its end. Frames and counts of events are PNG inside of Parquet: LeRobot's videos
-are lossy. A feature is there if every trial has it.
+``data/``, all Parquet of chunk-NNN/file-NNN, and ``videos/``. A row covers 1/100 s of the trial's
+time line and has the values known at its end. Counts of events are PNG inside of Parquet. Frames
+are the store's own FFV1, in MP4: lossless, and copied without decoding. A feature is there if every
+trial has it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
@@ -25,22 +24,30 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplab.plugins.publish.publication import SPLITS, Publication
-from sliplab.plugins.publish.sparse_png import sparse_png
+from sliplab.plugins.publish.sparse_png import sparse_pngs
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json_aside
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import EVENTS_KIND, I64, WRENCH, Json
+from sliplab.storage.trials.checksums import FRAMES as VIDEO_FILE
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.video import copy_frames
 
 VERSION, FPS = "v3.0", 100
 STEP_NS = 1_000_000_000 // FPS
 EVENTS, FRAMES = "observation.images.events", "observation.images.frames"
 STATE, SLIP = "observation.state", "slip"
 TIME, FRAME_TIME = "time_ns", "frame_time_ns"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _CHUNK = 1000
 """Files of a folder."""
+_SAMPLES = 32
+"""Frames of a trial that are decoded for the statistics of levels."""
+_SAMPLE_PX = 150
+"""Rows or columns of such a frame that are enough, as LeRobot has it."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _PLAIN = {
     "timestamp": "float32",
@@ -91,9 +98,9 @@ class _Levels:
     histogram: I64
     images: int = 0
 
-    def add(self, histogram: I64, images: int = 1) -> None:
-        """Add the levels of one image, shape (channels, 256), as often as it comes."""
-        self.histogram += histogram * images
+    def add(self, histogram: I64, images: int) -> None:
+        """Add the levels of some images, shape (channels or 1, 256)."""
+        self.histogram += histogram
         self.images += images
 
     def to_json(self) -> Json:
@@ -184,7 +191,19 @@ def _features(recordings: list[Recording]) -> tuple[dict[str, Json], tuple[str, 
         frame_px = {r.frame(0).shape for r in recordings}
         if len(frame_px) == 1:
             ((height, width),) = frame_px
-            features[FRAMES] = _pictures((width, height), 1)
+            features[FRAMES] = _pictures((width, height), 3) | {
+                "dtype": "video",
+                "info": {
+                    "video.height": height,
+                    "video.width": width,
+                    "video.codec": "ffv1",
+                    "video.pix_fmt": "gray",
+                    "video.is_depth_map": False,
+                    "video.fps": FPS,
+                    "video.channels": 3,
+                    "has_audio": False,
+                },
+            }
             features[FRAME_TIME] = {"dtype": "int64", "shape": [1], "names": None}
     return features, tuple(sorted(shared))
 
@@ -234,7 +253,7 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
         times = np.asarray(recording.frame_times())
         # the first one where there is none yet
         shown = np.maximum(np.searchsorted(times, ends, "right") - 1, 0)
-        columns[FRAMES] = _frame_images(made, recording, shown)
+        _frame_video(made, recording, shown)
         plain[FRAME_TIME] = times[shown]
     for name, values in plain.items():
         dtype = np.dtype(made.features[name]["dtype"])
@@ -244,10 +263,15 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
         flat = pa.array(rows.astype(np.float32).reshape(-1))
         columns[name] = pa.FixedSizeListArray.from_arrays(flat, rows.shape[1])
         made.figures(name).add(rows)
-    place = {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
-    path = made.folder / _file("data", **place)
+    place = _place(number)
+    path = made.folder / DATA.format(**place)
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.table({key: columns[key] for key in made.features}), path, compression="zstd")
+    table = pa.table({key: columns[key] for key in made.features if key in columns})
+    pq.write_table(table, path, compression="zstd")
+    video = {f"videos/{FRAMES}/{key}": value for key, value in place.items()} | {
+        f"videos/{FRAMES}/from_timestamp": 0.0,
+        f"videos/{FRAMES}/to_timestamp": count / FPS,
+    }
     made.episodes.append(
         {
             "episode_index": number,
@@ -262,13 +286,14 @@ def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording)
             "campaign": campaign.name,
             "trial": recording.folder.name,
             "start_ns": start,
+            **(video if FRAMES in made.features else {}),
         }
     )
     made.rows += count
 
 
-def _file(folder: str, chunk_index: int, file_index: int) -> str:
-    return f"{folder}/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+def _place(episode: int) -> dict[str, int]:
+    return {"chunk_index": episode // _CHUNK, "file_index": episode % _CHUNK}
 
 
 def _grid(recording: Recording) -> tuple[int, int]:
@@ -341,43 +366,41 @@ def _event_images(
     clock = recording.clock(EVENTS_KIND)
     events = recording.events()
     rows = (np.asarray(clock.to_reference(events.t_us * 1000)) - start) // STEP_NS
-    edges = np.searchsorted(rows, np.arange(count + 1)).tolist()
     height, width, channels = shape
-    packed, levels = [], made.levels(EVENTS)
-    for low, high in pairwise(edges):
-        part = slice(low, high)
-        pixels = (events.y[part].astype(np.int64), events.x[part], 1 - events.p[part].astype(int))
-        seen, counted = np.unique(np.ravel_multi_index(pixels, shape), return_counts=True)
-        level = np.minimum(counted, 255).astype(np.uint8)
-        found = np.bincount((seen % channels) * 256 + level, minlength=channels * 256)
-        found = found.reshape(channels, 256)
-        found[:, 0] = height * width - found[:, 1:].sum(1)
-        levels.add(found)
-        packed.append({"bytes": sparse_png(seen, level, height, width), "path": None})
-    return pa.array(packed, _IMAGE)
+    size = height * width * channels
+    pixels = (rows, events.y.astype(np.int64), events.x, 1 - events.p.astype(np.int64))
+    # pairs of row and pixel, in one sort
+    seen, counted = np.unique(np.ravel_multi_index(pixels, (count, *shape)), return_counts=True)
+    level = np.minimum(counted, 255).astype(np.uint8)
+    found = np.bincount(seen % channels * 256 + level, minlength=channels * 256)
+    found = found.reshape(channels, 256)
+    found[:, 0] = count * height * width - found[:, 1:].sum(1)
+    made.levels(EVENTS).add(found, count)
+    edges = np.searchsorted(seen, size * np.arange(count + 1))
+    packed = sparse_pngs(seen % size, level, edges, height, width)
+    paths = pa.nulls(count, pa.string())
+    return pa.StructArray.from_arrays([pa.array(packed, pa.binary()), paths], fields=list(_IMAGE))
 
 
-def _frame_images(made: _Set, recording: Recording, shown: I64) -> pa.Array:
-    """Pack the frame of each row; one that several rows have is encoded once."""
-    packed, levels = [], made.levels(FRAMES)
-    at, frames = 0, recording.frames()
-    image = next(frames)
-    for number, rows in zip(*np.unique(shown, return_counts=True), strict=True):
-        while at < number:
-            image, at = next(frames), at + 1
-        levels.add(np.bincount(image.reshape(-1), minlength=256)[None], int(rows))
-        done, data = cv2.imencode(".png", image)
-        if not done:
-            raise RuntimeError("OpenCV cannot write PNG")
-        packed += [{"bytes": data.tobytes(), "path": None}] * int(rows)
-    return pa.array(packed, _IMAGE)
+def _frame_video(made: _Set, recording: Recording, shown: I64) -> None:
+    """Write the frame of each row into the episode's video."""
+    path = made.folder / VIDEO.format(video_key=FRAMES, **_place(len(made.episodes)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    copy_frames(recording.files()[VIDEO_FILE], path, shown, FPS)
+    levels = made.levels(FRAMES)
+    with recording.frame_reader() as reader:
+        for number in shown[:: max(len(shown) // _SAMPLES, 1)].tolist():
+            image = reader.frame(number)
+            step = max(min(image.shape) // _SAMPLE_PX, 1)
+            image = image[::step, ::step]
+            levels.add(np.bincount(image.reshape(-1), minlength=256)[None], 1)
 
 
 def _meta(made: _Set, splits: Mapping[str, str]) -> None:
     folder = made.folder / "meta"
     (folder / "episodes" / "chunk-000").mkdir(parents=True)
     episodes = pa.Table.from_pylist(made.episodes)
-    pq.write_table(episodes, made.folder / _file("meta/episodes", 0, 0))
+    pq.write_table(episodes, folder / "episodes" / "chunk-000" / "file-000.parquet")
     tasks = pd.DataFrame({"task_index": list(made.tasks.values())}, index=list(made.tasks))
     tasks.to_parquet(folder / "tasks.parquet")
     stats = {name: found.to_json() for name, found in made.stats.items()}
@@ -393,8 +416,8 @@ def _meta(made: _Set, splits: Mapping[str, str]) -> None:
         "video_files_size_in_mb": 200,
         "fps": FPS,
         "splits": dict(splits),
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
+        "data_path": DATA,
+        "video_path": VIDEO if FRAMES in made.features else None,
         "features": made.features,
     }
     write_json_aside(folder / "info.json", info)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +32,28 @@ _WHOLE = 0b10100011
 _ADLER = 65_521
 
 
-def sparse_png(places: I64, values: U8, height: int, width: int) -> bytes:
-    """Return the PNG of an RGB image.
+def sparse_pngs(places: I64, values: U8, edges: I64, height: int, width: int) -> list[bytes]:
+    """Return the PNGs of RGB images.
 
     Args:
-        places: (n,) indices into the flat (height, width, 3) image, ascending.
+        places: (n,) indices into the flat (height, width, 3) image, ascending in each.
         values: (n,) levels there; all others are 0.
+        edges: (images + 1,) the first place of each image, and n.
     """
     row = 3 * width
     raw = places + places // row + 1  # a byte for the filter before each row
-    packed = _deflated(raw, values, height * (row + 1), _LENGTHS, _EXTRA)
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = [(b"IHDR", header), (b"IDAT", packed.tobytes()), (b"IEND", b"")]
-    return _SIGNATURE + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        for name, data in parts
-    )
+    header = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    begin, end, size = _SIGNATURE + header, _chunk(b"IEND", b""), height * (row + 1)
+    made = []
+    for low, high in pairwise(edges.tolist()):
+        packed = _deflated(raw[low:high], values[low:high], size, _LENGTHS, _EXTRA)
+        made.append(begin + _chunk(b"IDAT", packed.tobytes()) + end)
+    return made
+
+
+def _chunk(name: bytes, data: bytes) -> bytes:
+    named = name + data
+    return struct.pack(">I", len(data)) + named + struct.pack(">I", zlib.crc32(named))
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ import pandas as pd
 
 from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import MOST_BYTES, DataFolder
 from sliplab.storage.formats.foreign import LATEST_US, NO_TIME_NS, FormatError
 from sliplab.storage.formats.numpy_files import ZIP_MAGIC, array_of, arrays_of, release
@@ -106,7 +107,7 @@ def read_rows(folder: DataFolder, name: str) -> list[TableRow]:
             for number, line in lines
             for row in _from_json(place, [_json(place, line, number)], "lines", number)
         ]
-    return _from_csv(place, text)
+    return rows_of_csv(place, text)[1]
 
 
 def _json(place: str, text: str, line: int | None) -> Any:
@@ -136,16 +137,28 @@ def _from_json(place: str, found: Any, what: str, first: int = 1) -> list[TableR
 
 def _separator(line: str) -> str:
     """Return what separates the columns of a line of CSV."""
-    line = _QUOTED.sub("", line.strip())
+    line = _QUOTED.sub("", line.strip(" \r\n"))
     return next((each for each in _SEPARATORS[:3] if each in line), " " if " " in line else ",")
 
 
-def _from_csv(place: str, text: str) -> list[TableRow]:
-    reader = csv.reader(
-        io.StringIO(text), delimiter=_separator(text.partition("\n")[0]), strict=True
-    )
+def rows_of_csv(
+    place: str, text: str, columns: list[str] | None = None
+) -> tuple[list[str], list[TableRow]]:
+    """Read CSV; return its columns and rows. Empty lines are left out.
+
+    Args:
+        place: for messages.
+        columns: of a text without a heading.
+
+    Raises:
+        InputError: it is damaged, empty, names a column twice, or has a row of another length.
+    """
+    lines = (line for line in text.split("\n") if line.strip())
+    separator = _separator(next(lines, ""))
+    if separator == " " and " " not in next(lines, " ").strip():
+        separator = ","  # the heading is a name of several words
+    reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
     rows: list[TableRow] = []
-    columns: list[str] | None = None
     try:
         for cells in reader:
             if not any(cell.strip() for cell in cells):
@@ -160,7 +173,9 @@ def _from_csv(place: str, text: str) -> list[TableRow]:
                     place,
                     f"row {reader.line_num}",
                     None,
-                    f"has {len(cells)} cells below a heading of {len(columns)} columns",
+                    f"has {plural(len(cells), 'cell')} below a heading of "
+                    f"{plural(len(columns), 'column')}; a number has a decimal point, and text "
+                    "that contains the separator has quotes",
                 )
             values = {
                 column: cell.strip()
@@ -172,7 +187,7 @@ def _from_csv(place: str, text: str) -> list[TableRow]:
         raise InputError(place, f"row {reader.line_num}", None, f"is not CSV: {error}") from None
     if columns is None:
         raise InputError(place, "", None, "is empty; its first line names the columns")
-    return rows
+    return columns, rows
 
 
 def read_columns(

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sliplab.protocols.later import Later
-from sliplab.storage.streams import U8
+from sliplab.storage.streams import I64, U8
 
 if TYPE_CHECKING:
     import av
@@ -162,6 +162,37 @@ def read_frames(path: Path, threads: int = 1) -> Iterator[U8]:
         stream.codec_context.thread_type = "FRAME" if threads > 1 else "SLICE"
         for frame in container.decode(stream):
             yield frame.to_ndarray(format="gray")
+
+
+def copy_frames(source: Path, target: Path, numbers: I64, rate_hz: int) -> None:
+    """Write frames of a video at a fixed rate, without decoding, as FFV1 in MP4.
+
+    Every frame is a key frame, so a packet may be left out or come again.
+
+    Args:
+        numbers: (n,) number in `source` of each frame, ascending.
+
+    Raises:
+        IndexError: `source` has fewer frames.
+    """
+    base, due = Fraction(1, rate_hz), iter(enumerate(numbers.tolist()))
+    options = {"fflags": "+bitexact"}
+    with (
+        av.open(video_url(source)) as read,
+        av.open(video_url(target), "w", format="mp4", options=options) as written,
+    ):
+        stream = written.add_stream_from_template(read.streams.video[0])
+        stream.time_base = base
+        at, number = next(due, (0, None))
+        for here, data in enumerate(bytes(packet) for packet in read.demux(video=0)):
+            while number == here and data:
+                packet = av.Packet(data)
+                packet.stream, packet.time_base, packet.is_keyframe = stream, base, True
+                packet.pts, packet.dts, packet.duration = at, at, 1
+                written.mux(packet)
+                at, number = next(due, (0, None))
+    if number is not None:
+        raise IndexError(f"{source}: has no frame {number}")
 
 
 def read_frame(path: Path, index: int) -> U8:

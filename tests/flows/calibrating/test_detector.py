@@ -61,11 +61,16 @@ def test_it_says_what_so_much_holding_supports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "mock.detector.json").write_text("the old one")
     assert run("calibrate", "detector", "--rig", "mock", "--hold", 5, "--yes") == 0
-    said = " ".join(capsys.readouterr().out.split())
+    captured = capsys.readouterr()
+    said = " ".join(captured.out.split())
     assert "detector of rig mock (simulated)" in said
     assert "1 an hour takes 3.69 h (--hold)" in said
-    assert (tmp_path / "mock.detector.json").is_file()
+    assert load_calibration(tmp_path / "mock.detector.json").rig == "mock"
+    old = tmp_path / f"mock.detector.before-{date.today().isoformat()}.json"
+    assert old.read_text() == "the old one"
+    assert f"the old file is kept as {old}" in " ".join((captured.out + captured.err).split())
 
 
 def test_a_dry_run_lists_the_motion_and_moves_nothing(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -185,9 +186,124 @@ def test_command_refuses_with_its_reason(tmp_path: Path) -> None:
     done = here("align", tmp_path / "a.csv", tmp_path / "a.csv", "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)["refused"] == "ambiguous"
-    (tmp_path / "b.csv").write_text("t\n1.0\nlate\n")
+
+
+A = _random_events() + 12.5
+LINES = [f"{t:.9f}" for t in A]
+PLAIN = "\n".join(["t", *LINES])
+LINE_5 = f"\n{LINES[3]}\n"
+
+
+def _table(heading: str, row: str, factor: float = 1.0) -> str:
+    return "\n".join([heading, *(row.format(factor * t, k=k) for k, t in enumerate(A))])
+
+
+# what a file holds, and the column that is used or the fault that is named
+FILES: dict[str, tuple[str | bytes, str]] = {
+    "BOM": ("\ufeff" + PLAIN, "t (s)"),
+    "CRLF": (PLAIN.replace("\n", "\r\n"), "t (s)"),
+    "UTF-16": (PLAIN.encode("utf-16"), "t (s)"),
+    "comment": ("# made by hand\n\n" + PLAIN, "t (s)"),
+    "no heading": (PLAIN[2:], "t (s)"),
+    "semicolons": (_table("t;x", "{:.9f};1"), "t (s)"),
+    "tabs": (_table("\tTime [ms]", "{k}\t{:.6f}", 1e3), "Time [ms] (ms)"),
+    "two words": (_table("Time [ms]", "{:.6f}", 1e3), "Time [ms] (ms)"),
+    "micro": (_table("time (µs)", '"{:.3f}"', 1e6), "time (µs) (us)"),
+    "one with a unit": (_table("frame,seen_ms", "{k},{:.6f}", 1e3), "seen_ms (ms)"),
+    "only one": (_table("stamp", "{:.9e}"), "stamp (s)"),
+    "empty": (b"", "is empty; its first line names the columns"),
+    "only a heading": ("t\n", "is empty below its heading t"),
+    "binary": (b"\0" * 99, "byte 0: is no text"),
+    "Latin-1": ("Zeit µs\n1".encode("latin-1"), "byte 5: is not UTF-8 text"),
+    "gzip": (gzip.compress(PLAIN.encode()), "is a workbook or compressed: save it as CSV"),
+    "Excel": (b"PK\3\4", "is a workbook or compressed: save it as CSV"),
+    "huge": (b"1\n" * 600, "is larger than 0 MiB: give only the events"),
+    "unknown": (_table("frame,stamp", "{k},{:.9f}"), "heading = frame, stamp: name the column"),
+    "long rows": (_table("1", "{k},{:.9f}"), "row 2: has 2 cells below a heading of 1 column"),
+    "decimal comma": (PLAIN.replace(".", ","), "1 column; a number has a decimal point"),
+    "German": (_table("t;x", "{:.9f};1").replace(".", ","), "a number, with a decimal point"),
+    "NaN": (PLAIN.replace(LINE_5, "\nNaN\n"), "row 5, t = NaN: must be a time in s"),
+    "word": (PLAIN.replace(LINE_5, "\nlate\n"), "row 5, t = late: must be a time in s"),
+    "empty cell": (_table("t,x", "{:.9f},1").replace(LINES[3], ""), "row 5, t: must be a time"),
+    "thousands": (_table("t", '"{:,.0f}"', 1e6), "row 2, t = "),
+    "ns as s": (_table("t", "{:.0f}", 1e9), "is no time in s: name the unit by --unit"),
+    "ids of text": (_table("t,id", "{:.9f},e{k}"), "row 2, id = e0: must be a whole number"),
+    "broken ids": (_table("t,id", "{:.9f},{k}.5"), "row 2, id = 0.5: must be a whole number"),
+    "levels of text": (_table("t,state", "{:.9f},up"), "row 2, state = up: must be 0 or 1"),
+    "no rising edge": (_table("t,state", "{:.9f},0"), "state: is 0 in every row"),
+    "all equal": (_table("t", "3"), "row 2 = 3 s: is the time of all 200 events"),
+    "reversed": ("\n".join(["t", *LINES[::-1]]), "as 198 others: not in order; sort the events"),
+    "row of disorder": ("\n".join(["t", *LINES[::-1]]), f"row 3 = {A[-2]:.9g} s: is earlier"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_of_strangers_are_read_or_their_fault_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    data, text = FILES[name]
+    if name == "huge":
+        monkeypatch.setattr("sliplab.plugins.align.events.MOST_TABLE", 1000)
+    a, b = tmp_path / "a.csv", tmp_path / "b.csv"
+    a.write_bytes(data if isinstance(data, bytes) else data.encode())
+    _write(b, "t", A - 12.5)
+    done = here("align", a, b, "--json")
+    if done.returncode == 0:
+        assert json.loads(done.stdout)["columns"]["a"] == text
+    else:
+        assert done.returncode == 2
+        assert text in done.stderr
+        assert str(a) in done.stderr
+
+
+# lists that are refused, and the likely cause
+PAIRS = {
+    "A in ms": (_table("t", "{:.6f}", 1e3), PLAIN, "1e3 times those of B: check the units"),
+    "B in ms": (PLAIN, _table("t", "{:.6f}", 1e3), "1e-3 times those of B: check the units"),
+    "two parts": (
+        "\n".join(["t", *LINES[100:], *LINES[:100]]),
+        _table("t", "{k}"),
+        f"row 102 = {A[0]:.9g} s: is earlier",
+    ),
+    "reversed ids": (
+        "\n".join(["t,id", *(f"{t:.9f},{199 - k}" for k, t in enumerate(A))]),
+        _table("t,id", "{:.9f},{k}"),
+        "as no two clocks do: check that the ids of both mean the same, in the same order",
+    ),
+    "equal ids": (
+        _table("t,id", "{:.9f},7"),
+        _table("t,id", "{:.9f},{k}"),
+        "0 ids in both lists, once in each; at least 5 are needed",
+    ),
+    "one event": ("t\n1", PLAIN, "has 1 event; at least 5 are needed"),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_refusals_name_the_likely_cause(tmp_path: Path, name: str) -> None:
+    first, second, text = PAIRS[name]
+    (tmp_path / "a.csv").write_text(first)
+    (tmp_path / "b.csv").write_text(second)
     done = here("align", tmp_path / "a.csv", tmp_path / "b.csv")
-    assert "row 2 = late: must be a number" in done.stderr
+    assert done.returncode == 1
+    assert text in " ".join(done.stderr.split())
+    assert "raise it" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--map", "b.csv"], "--map = b.csv: needs --out"),
+        (["--out", "none/c.csv"], "--out = none/c.csv: its folder does not exist"),
+        (["--unit", "h"], "unit = h: must be one of s, ms, us, ns"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) -> None:
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text(PLAIN)
+    done = here("align", tmp_path / "a.csv", tmp_path / "b.csv", *options)
+    assert done.returncode == 2
+    assert text in done.stderr
 
 
 def _write(path: Path, name: str, values: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 from sliplab.storage.trials.video import (
     FrameReader,
     VideoWriter,
+    copy_frames,
     count_frames,
     read_frame,
     read_frames,
@@ -37,6 +38,21 @@ def test_frames_are_lossless_and_countable(tmp_path: Path) -> None:
     assert np.array_equal(read_frame(path, 7), images[7])
     with pytest.raises(IndexError, match="no frame 9"):
         read_frame(path, 9)
+
+
+def test_copied_frames_are_lossless_and_the_same_bytes(tmp_path: Path) -> None:
+    path, copies = tmp_path / "v.mkv", [tmp_path / "a.mp4", tmp_path / "b.mp4"]
+    write(path, 9)
+    numbers = np.array([0, 0, 2, 3, 3, 8])
+    for copy in copies:
+        copy_frames(path, copy, numbers, 50)
+    assert copies[0].read_bytes() == copies[1].read_bytes()
+    assert np.array_equal(list(read_frames(copies[0])), frames(9).images[numbers])
+    with av.open(str(copies[0])) as file:
+        times = [frame.time for frame in file.decode(video=0)]
+    np.testing.assert_allclose(times, np.arange(6) / 50)
+    with pytest.raises(IndexError, match="no frame 9"):
+        copy_frames(path, copies[0], np.array([8, 9]), 50)
 
 
 def test_the_same_frames_are_the_same_bytes(tmp_path: Path) -> None:
