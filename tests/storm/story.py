@@ -11,8 +11,10 @@ import random
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from sliplab.flows.planning.disk_space import RESERVE
 from tests.conftest import ROOT
 from tests.crash.campaign import protocol
+from tests.storm.lies import OF_ARM, OF_FORCE
 
 Story = dict[str, Any]
 Step = dict[str, Any]
@@ -56,6 +58,12 @@ FAULTS: dict[str, Draw] = {
     "stream_gone": lambda rng: {"stream": "warm"},
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
+NAMES = (
+    *("data.h5", "provenance.json", "record.json", "checksums.json", "cause.json"),
+    *("/trials", "/incoming", "/quarantine", "campaign.json", "/bench", "store.json"),
+    *("skipped.json", "/control", ".done.json", "/log", "/objects", "/remote/", "/pulled/"),
+)
+"""Parts of paths, each of which a kill or a power cut may wait for."""
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
@@ -69,9 +77,12 @@ def draw(seed: int) -> Story:
     story = {"seed": seed, "protocol": _protocol(rng), "rig": _rig(rng)}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
-    steps = []
+    steps: list[Step] = []
     for number in range(rng.randint(4, 8)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
+        last = steps[-1] if steps else {}
+        if last.get("weather", {}).keys() & {"kill", "power"} and rng.random() < 0.5:
+            kind = rng.choice(AFTER_AN_END.get(last["do"], ("verify",)))
         steps.append({"do": kind, **STEPS[kind][1](rng, story, trials)})
     return {**story, "steps": steps}
 
@@ -93,6 +104,10 @@ def _protocol(rng: random.Random) -> dict[str, Any]:
     rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
     both = {"warm_up": warm_up, "rezero": rezero}
     collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
+    if rng.random() < 0.3:
+        condition = {name: factors[name]["values"][0] for name in ("depth", "speed", "direction")}
+        collection["references"] = {"every": 2, "condition": condition}
+        collection["gates"]["reference"] = {"event_rate": rng.choice(["20 %", "60 %"])}
     return data
 
 
@@ -146,13 +161,16 @@ def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
         return {}
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
-    cut = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
+    cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
+    if rng.random() < 0.6:  # at one of few calls, which would be met seldom among all
+        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 4)), "name": rng.choice(NAMES)}
+        cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
     drawn: list[Step] = [
         {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
         {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
         {"full": full},
-        {"low": {"free": rng.choice([0, 150_000_000])}},
+        {"low": {"free": rng.choice([0, 150_000_000, RESERVE + 2000, RESERVE + 20_000])}},
         {"read_only": {}},
     ]
     made = rng.choices(drawn, [4, 4, 2, 1, 1])[0]
@@ -178,36 +196,67 @@ def _event(rng: random.Random, story: Story, trials: int) -> Step:
             {"log": {}},
             {"clock": rng.choice([-7200, -3, 40, 90_000])},
             {"rival": True},
+            _lie(rng, story),
         ]
     )
     return {"at_s": round(rng.uniform(0, 130), 2), **made}
 
 
+def _lie(rng: random.Random, story: Story) -> Step:
+    limited = "force" in story["rig"]["limits"]
+    kinds = (*OF_ARM, *OF_FORCE, *OF_FORCE) if limited else OF_ARM
+    return {"lie": rng.choice(kinds), "seconds": rng.choice([1.5, 20.0, 1e9])}
+
+
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
     events = [_event(rng, story, trials) for _ in range(rng.choice([0, 1, 2, 3]))]
+    window = {"window_s": round(rng.uniform(0, 200), 1)} if rng.random() < 0.15 else {}
     return {
         "faults": _faults(rng, story),
         "events": sorted(events, key=lambda event: event["at_s"]),
         "most": rng.choice([None, None, 2]),
+        **window,
         **_weather(rng),
     }
+
+
+def _damage(rng: random.Random, story: Story, trials: int) -> Step:
+    where = rng.choice(["trials", "trials", "incoming", "remote"])
+    how = "cut" if where == "incoming" else rng.choice(["cut", "flip"])
+    return {"trial": rng.randrange(trials), "where": where, "how": how}
+
+
+def _copy(rng: random.Random, story: Story, trials: int) -> Step:
+    step = {"fails": rng.choice([0, 0, 2, 3, 5, 9]), "short": rng.random() < 0.3}
+    return {**step, "check": rng.random() < 0.2, **_weather(rng)}
 
 
 def _between(rng: random.Random, story: Story, trials: int) -> Step:
     return {**_ask(rng, story, trials), **_weather(rng, 0.2)}
 
 
+def _serve(rng: random.Random, story: Story, trials: int) -> Step:
+    return {"seed": rng.randrange(10_000), "lost": rng.choice([0.0, 0.1, 0.4])}
+
+
 STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "night": (5, _night),
     "ask": (2, _between),
     "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
-    "verify": (0.5, lambda rng, story, trials: {}),
-    "damage": (0.3, lambda rng, story, trials: {"trial": rng.randrange(trials)}),
+    "verify": (0.5, lambda rng, story, trials: {"quarantine": rng.random() < 0.5}),
+    "damage": (0.8, _damage),
     "import": (0.5, lambda rng, story, trials: _weather(rng)),
-    "push": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
-    "pull": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
+    "push": (1.5, _copy),
+    "pull": (1.5, _copy),
+    "serve": (0.5, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
+AFTER_AN_END = {
+    "night": ("night", "verify", "damage", "push", "ask"),
+    "push": ("pull", "pull", "push", "damage"),
+    "pull": ("pull", "push", "damage"),
+}
+"""What follows a kill or a power cut in a step: what it has left is used at once."""
 
 
 def shorter(story: Story) -> Iterator[Story]:
