@@ -264,7 +264,7 @@ class StatusReader:
         return self._plans[key]
 
     def _folders(self, campaign: Campaign) -> dict[str, _TrialFolder]:
-        """Return the complete trials by id; each folder is read once, its files' sizes each time."""
+        """Return the complete trials by id; a folder is read once, its files' sizes each time."""
         found = {}
         for path in campaign.folders("trials"):
             key = path, path.stat().st_ino  # a trial that is taken again is another folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -177,10 +178,8 @@ async def _play(page: Page, served: ServedRuns, rig: UUID, words: UUID, rng: ran
         if not calm and rng.random() < 0.02:
             page.cancel()
         page.tick()
-        try:
+        with suppress(TimeoutError):
             await served._look(page, threads)
-        except TimeoutError:
-            pass
         await asyncio.sleep(0)
         for process in page.processes:
             late = process.asked_s is not None and page.now_s - process.asked_s > 2 * STOP_LIMIT_S

@@ -46,7 +46,8 @@ class Played:
 
     Attributes:
         trace: what happened, line by line; the same for the same story.
-        rig_s: virtual time of the rig. passed_s: of nights, with the pauses that were stepped through.
+        rig_s: virtual time of the rig.
+        passed_s: virtual time of nights, with the pauses that were stepped through.
         errors: of clocks with a 95 % interval, as a share of it, by device.
         wrong: the invariant that was broken, and how; None if all held.
     """

@@ -82,7 +82,10 @@ class Witness:
 
         def starting(arm: MockArm, path: Sequence[Segment]) -> None:
             self._look_at_path(arm._world, path)
+            state = arm._world.arm_state
             start(arm, path)
+            if state is ArmState.PROTECTIVE_STOP:
+                self.wrong("no motion after a stop", f"it is sent on in {state.value}")
             self._segment, self._lied_s = path[-1], None
             # what is sent from a false pose goes to a false place, which nothing here can know
             self._misled = self.lie.active in {"pose_away", "pose_frozen"}
@@ -172,8 +175,6 @@ class Witness:
 
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
         here = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
-        if world.arm_state is ArmState.PROTECTIVE_STOP:
-            self.wrong("no motion after a stop", f"it is sent on in {world.arm_state.value}")
         for segment in path:
             there = world.plane.sensor(segment.to)
             if self._asked_s is not None:
