@@ -122,7 +122,9 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
             failed.append({"seed": seed, "wrong": text, "story": None})
         seed += asked.every
         if over():
-            return _result(hashes, failed, rig_s, passed_s, time.monotonic() - began)
+            result = _result(hashes, failed, rig_s, passed_s, time.monotonic() - began)
+            found = {name: [clocks.beyond[name], count] for name, count in clocks.all.items()}
+            return {**result, "clocks_beyond_their_interval": found}
 
 
 class Clocks:

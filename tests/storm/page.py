@@ -18,12 +18,13 @@ from prefect.client.schemas.responses import SetStateStatus
 from prefect.states import Cancelling, Completed, Running, Scheduled
 
 from sliplab.flows.running import run_records
-from sliplab.flows.server import runs
-from sliplab.flows.server.runs import STOP_LIMIT_S, ServedRuns
-from sliplab.flows.server.schedules import DAYS, window_end
+from sliplab.flows.server import runs, schedules
+from sliplab.flows.server.runs import ServedRuns
 from tests.storm.virtual import Notes
 
 POLL_S = 1.0
+STOP_LIMIT_S = 30.0
+"""Time that a run has to stop its arm and end."""
 CALM_S = 250
 """Until when runs come due and answers get lost."""
 ZONES = ("UTC", "Europe/Rome", "America/New_York")
@@ -217,13 +218,13 @@ def _check_windows(rng: random.Random, notes: Notes) -> None:
     """Ends of windows, against a search minute by minute."""
     for _ in range(5):
         due = datetime.fromtimestamp(1_795_000_020 + 60 * rng.randrange(600_000), UTC)
-        zone, day = rng.choice(ZONES), rng.choice(["", "", rng.choice(DAYS)])
+        zone, day = rng.choice(ZONES), rng.choice(["", "", rng.choice(schedules.DAYS)])
         clock = f"{rng.choice([0, 3, 6, 22]):02d}:{rng.choice([0, 30]):02d}"
-        found = window_end(due, f"{day} {clock}".strip(), zone)
+        found = schedules.window_end(due, f"{day} {clock}".strip(), zone)
         moment = due + timedelta(minutes=1)
         while True:
             wall = moment.astimezone(ZoneInfo(zone))
-            if f"{wall:%H:%M}" == clock and day in {"", DAYS[wall.weekday()]}:
+            if f"{wall:%H:%M}" == clock and day in {"", schedules.DAYS[wall.weekday()]}:
                 break
             moment += timedelta(minutes=1)
         if found.timestamp() != moment.timestamp():

@@ -59,9 +59,10 @@ FAULTS: dict[str, Draw] = {
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
 NAMES = (
-    *("data.h5", "provenance.json", "record.json", "checksums.json", "cause.json"),
-    *("/trials", "/incoming", "/quarantine", "campaign.json", "/bench", "store.json"),
-    *("skipped.json", "/control", ".done.json", "/log", "/objects", "/remote/", "/pulled/"),
+    *("=1/data.h5", "=1/provenance.json", "=1/record.json", "=1/journal.jsonl"),
+    *("=1/checksums.json", "=1/checksums.json", "=1/.cause.json", "/trials", "/trials"),
+    *("/incoming", "/quarantine", "/campaign.json", "/bench", "/store.json", "/rig.yaml"),
+    *("/skipped.json", "/control", ".done.json", "/log", "/objects", "/remote/", "/pulled/"),
 )
 """Parts of paths, each of which a kill or a power cut may wait for."""
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
@@ -81,9 +82,13 @@ def draw(seed: int) -> Story:
     for number in range(rng.randint(4, 8)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         last = steps[-1] if steps else {}
-        if last.get("weather", {}).keys() & {"kill", "power"} and rng.random() < 0.5:
+        ended = last.get("weather", {}).keys() & {"kill", "power"}
+        if ended and rng.random() < 0.5:
             kind = rng.choice(AFTER_AN_END.get(last["do"], ("verify",)))
-        steps.append({"do": kind, **STEPS[kind][1](rng, story, trials)})
+        step = {"do": kind, **STEPS[kind][1](rng, story, trials)}
+        if ended and kind == "damage" and last["do"] == "night":
+            step |= {"where": "incoming", "how": "cut"}
+        steps.append(step)
     return {**story, "steps": steps}
 
 
@@ -162,7 +167,7 @@ def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
-    if rng.random() < 0.6:  # at one of few calls, which would be met seldom among all
+    if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
         kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 4)), "name": rng.choice(NAMES)}
         cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
@@ -252,7 +257,7 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 AFTER_AN_END = {
-    "night": ("night", "verify", "damage", "push", "ask"),
+    "night": ("night", "verify", "damage", "damage", "push", "ask"),
     "push": ("pull", "pull", "push", "damage"),
     "pull": ("pull", "push", "damage"),
 }

@@ -13,7 +13,7 @@ from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmState, Segment
-from sliplab.rigs.core.motion_watch import STUCK_MM, STUCK_S, is_near
+from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.world import SimulatedWorld
@@ -27,10 +27,14 @@ PLATE_MM = 1.0
 """How far the true plate may lie from the taught one, with its tilt over the reach."""
 SLACK_S = 0.3
 """Beyond one poll, until a fault that the poses show has stopped the arm."""
+STUCK_S, STUCK_MM = 3.0, 0.5
+"""Time, and motion at the commanded speed, until a pose that does not change stops the arm."""
 SILENT_S = 0.5
 """Until a force sensor that does not answer has stopped the arm."""
 ZERO_MM = 0.15
 """How far depth zero may be from the true plate where nothing disturbs it."""
+WAIT_S = 0.05
+"""By how much a wait may be longer or shorter than planned."""
 PLACE_MM = 0.3
 """How far a step may end from where it was to, where nothing disturbs it."""
 
@@ -163,7 +167,7 @@ class Witness:
         if not self._calm:
             return
         if not isinstance(step, Move):
-            if not abs(took_s - step.seconds) <= 2 * self._poll_s:
+            if not abs(took_s - step.seconds) <= WAIT_S:
                 self.wrong("a trial is as planned", f"waits {took_s:.2f} s, not {step.seconds:.2f}")
             return
         world = _world(rig)
@@ -172,6 +176,9 @@ class Witness:
         if not math.dist(true[:3], wanted[:3]) <= PLACE_MM:
             off = math.dist(true[:3], wanted[:3])
             self.wrong("a trial is as planned", f"{step.phase} ends {off:.2f} mm off")
+        planned_s = at.distance_mm(step.to) / step.speed_mm_s
+        if not took_s >= 0.95 * planned_s - WAIT_S:
+            self.wrong("a trial is as planned", f"{step.phase} takes {took_s:.2f} s of {planned_s}")
 
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
         here = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
