@@ -83,8 +83,8 @@ def draw(seed: int) -> Story:
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         last = steps[-1] if steps else {}
         ended = last.get("weather", {}).keys() & {"kill", "power"}
-        if ended and rng.random() < 0.5:
-            kind = rng.choice(AFTER_AN_END.get(last["do"], ("verify",)))
+        if (ended or last.get("do") in {"push", "damage"}) and rng.random() < 0.5:
+            kind = rng.choice(FOLLOWS.get(last["do"], ("verify",)))
         step = {"do": kind, **STEPS[kind][1](rng, story, trials)}
         if ended and kind == "damage" and last["do"] == "night":
             step |= {"where": "incoming", "how": "cut"}
@@ -168,7 +168,7 @@ def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
     if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
-        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 4)), "name": rng.choice(NAMES)}
+        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": rng.choice(NAMES)}
         cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
     drawn: list[Step] = [
@@ -219,7 +219,7 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
     return {
         "faults": _faults(rng, story),
         "events": sorted(events, key=lambda event: event["at_s"]),
-        "most": rng.choice([None, None, 2]),
+        "most": rng.choice([None, 1, 1, 2]),  # so that later nights have trials left
         **window,
         **_weather(rng),
     }
@@ -256,12 +256,13 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "serve": (0.5, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
-AFTER_AN_END = {
+FOLLOWS = {
     "night": ("night", "verify", "damage", "damage", "push", "ask"),
     "push": ("pull", "pull", "push", "damage"),
     "pull": ("pull", "push", "damage"),
+    "damage": ("verify", "night", "push", "pull"),
 }
-"""What follows a kill or a power cut in a step: what it has left is used at once."""
+"""What often follows a step that ended in a kill or a power cut, or changed what others read."""
 
 
 def shorter(story: Story) -> Iterator[Story]:
