@@ -79,7 +79,7 @@ def draw(seed: int) -> Story:
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
     steps: list[Step] = []
-    for number in range(rng.randint(4, 8)):
+    for number in range(rng.randint(8, 16)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         last = steps[-1] if steps else {}
         ended = last.get("weather", {}).keys() & {"kill", "power"}
@@ -245,14 +245,14 @@ def _serve(rng: random.Random, story: Story, trials: int) -> Step:
 
 
 STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
-    "night": (5, _night),
+    "night": (4, _night),
     "ask": (2, _between),
     "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
     "verify": (0.5, lambda rng, story, trials: {"quarantine": rng.random() < 0.5}),
-    "damage": (0.8, _damage),
+    "damage": (1, _damage),
     "import": (0.5, lambda rng, story, trials: _weather(rng)),
-    "push": (1.5, _copy),
-    "pull": (1.5, _copy),
+    "push": (2, _copy),
+    "pull": (2, _copy),
     "serve": (0.5, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
