@@ -219,7 +219,7 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
     return {
         "faults": _faults(rng, story),
         "events": sorted(events, key=lambda event: event["at_s"]),
-        "most": rng.choice([None, 1, 1, 2]),  # so that later nights have trials left
+        "most": rng.choice([None, None, 1, 2]),  # so that later nights have trials left
         **window,
         **_weather(rng),
     }
@@ -253,7 +253,7 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "import": (0.5, lambda rng, story, trials: _weather(rng)),
     "push": (2, _copy),
     "pull": (2, _copy),
-    "serve": (0.5, _serve),
+    "serve": (1, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 FOLLOWS = {
