@@ -27,7 +27,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.process import named
 from sliplab.storage.trials import control
-from sliplab.storage.trials.checksums import PROVENANCE, incomplete
+from sliplab.storage.trials.checksums import PROVENANCE, Checksums, incomplete, read_sums
 from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
 from sliplab.storage.trials.store import IMPORTED, Campaign, Store
@@ -150,10 +150,11 @@ class StoreStatus:
 
 @dataclass(frozen=True)
 class _TrialFolder:
-    """When a committed trial ended and with which skin, if that is known; its bytes on disk."""
+    """When a committed trial ended and with which skin, if that is known; its files' checksums."""
 
     ended: datetime | None
     skin: str | None
+    sums: Checksums
     bytes: int
 
 
@@ -263,15 +264,18 @@ class StatusReader:
         return self._plans[key]
 
     def _folders(self, campaign: Campaign) -> dict[str, _TrialFolder]:
-        """Return the complete trials by id; each folder is read once, as it never changes."""
+        """Return the complete trials by id; a folder is read once, its files' sizes each time."""
         found = {}
         for path in campaign.folders("trials"):
             key = path, path.stat().st_ino  # a trial that is taken again is another folder
-            if key not in self._known and incomplete(path) is None:
+            known = self._known.get(key)
+            if incomplete(path, None if known is None else known.sums) is not None:
+                continue
+            if known is None:
                 size = sum(each.stat().st_size for each in path.iterdir() if each.is_file())
-                self._known[key] = _TrialFolder(*_provenance(path / PROVENANCE), size)
-            if key in self._known:
-                found[path.name] = self._known[key]
+                ended, skin = _provenance(path / PROVENANCE)
+                known = self._known[key] = _TrialFolder(ended, skin, read_sums(path), size)
+            found[path.name] = known
         return found
 
     def _drifts(self, plan: Plan, campaign: Campaign, committed: set[str]) -> list[DriftStatus]:

@@ -178,7 +178,7 @@ def failure(error: Exception) -> Failure:
             exit_codes.WRONG_INPUT,
         )
     trace = ""
-    if type(error).__name__ not in _EXPECTED:
+    if not any(kind.__name__ in _EXPECTED for kind in type(error).__mro__):
         trace = "".join(traceback.format_exception(error, limit=-8))
     return Failure(str(error) or type(error).__name__, exit_codes.FAILED, trace=trace)
 

@@ -155,13 +155,16 @@ def write_sums(folder: Path, names: Iterable[str]) -> None:
     write_json(folder / CHECKSUMS, sums)
 
 
-def incomplete(folder: Path) -> str | None:
+def incomplete(folder: Path, sums: Checksums | None = None) -> str | None:
     """Return why a trial's folder is incomplete, by the sizes of its files; None if complete.
 
     Bytes that changed in place are found by `storage.trials.verify` only.
+
+    Args:
+        sums: its checksums, where they were read before.
     """
     try:
-        sums = read_sums(folder)
+        sums = read_sums(folder) if sums is None else sums
     except ValueError as error:
         return str(error)
     for name, known in sums.items():

@@ -313,7 +313,7 @@ class Campaign:
                 self.quarantine(path, cause)
             else:  # a killed program was about to move it
                 self._move_to_quarantine(path)
-        for path in self.folders("quarantine"):
+        for path in (*self.folders("quarantine"), *self.folders("trials")):
             sweep_temporary(path)
         return len(left)
 

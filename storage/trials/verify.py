@@ -17,7 +17,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.storage.errors import StoreError, own_fault
-from sliplab.storage.files import read_json, temporary_files
+from sliplab.storage.files import is_temporary, read_json, temporary_files
 from sliplab.storage.process import named
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
@@ -120,7 +120,7 @@ def _campaign(
         if on_trial is not None:
             on_trial(trial.name)
         were_open = [path for path in trial.glob("*.h5") if left_open(path)]
-        problems += verify_trial(trial)
+        problems += verify_trial(trial) + _temporary(trial, campaign.name, _next(campaign))
         if on_mended is not None:
             for path in were_open:
                 if not left_open(path):
@@ -200,7 +200,7 @@ def _trial(folder: Path) -> Found:
     found += [
         (path, "does not belong here")
         for path in sorted(folder.iterdir())
-        if not _belongs(path.name, sums)
+        if not _belongs(path.name, sums) and not is_temporary(path.name)
     ]
     try:
         Provenance.load(folder / PROVENANCE)

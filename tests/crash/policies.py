@@ -20,16 +20,18 @@ class Killer:
         at: the number of the call.
         share: of a write's bytes that still reach the file; other calls are made first when it is
             over a half.
+        name: part of the paths whose calls are counted.
     """
 
     kind: str
     at: int
     share: float
+    name: str = ""
     seen: int = 0
 
     def __call__(self, call: Call) -> int:
         """Make the call, or die in it."""
-        if self.kind not in {"any", call.kind}:
+        if self.kind not in {"any", call.kind} or self.name not in f"{call.path} {call.to}":
             return call.go()
         self.seen += 1
         if self.seen < self.at:

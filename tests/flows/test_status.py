@@ -14,7 +14,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.status import StatusReader, night_of, nights_needed, pace_error, paces_of
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.checksums import PROVENANCE
+from sliplab.storage.trials.checksums import DATA, PROVENANCE
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Campaign, Store
 from tests.command_line import answer
@@ -66,6 +66,18 @@ def test_a_store_says_what_is_done_left_excluded_and_by_whom_it_is_held(tmp_path
     (shown,) = answer("status", store.folder)["campaigns"]
     assert (shown["missing"], shown["excluded"][0]["by"]) == (0, "ben")
     assert reader.read(EVENING).running is None
+
+
+def test_a_trial_that_is_cut_short_after_it_was_read_counts_no_longer(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path, short())
+    reader = StatusReader(Store.open(tmp_path / "store"))
+    trials = pending_trials(work.plan, campaign)[:2]
+    work.take(trials)
+    assert reader.read(EVENING).campaigns[0].committed == 2
+    data = campaign.folder / "trials" / trials[0].id / DATA
+    data.chmod(0o644)
+    data.write_bytes(data.read_bytes()[:1000])
+    assert reader.read(EVENING).campaigns[0].committed == 1
 
 
 def test_a_damaged_campaign_is_named_and_hides_no_other(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,8 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
     warm()
     if asked.plant:
         PLANTS[asked.plant]()
-    seed, began, rig_s = asked.seed, time.monotonic(), 0.0
+    seed, began, rig_s, passed_s = asked.seed, time.monotonic(), 0.0, 0.0
+    clocks = Clocks()
     failed: list[dict[str, Any]] = []
     hashes: dict[int, str] = {}
 
@@ -107,7 +109,7 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
     while True:
         story = asked.story or draw(seed)
         played = play(story)
-        rig_s += played.rig_s
+        rig_s, passed_s = rig_s + played.rig_s, passed_s + played.passed_s
         hashes[seed] = played.hash
         if asked.show:
             print(json.dumps(story), *played.trace, sep="\n", file=sys.stderr)
@@ -115,17 +117,62 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
             print(f"seed {seed}: {wrong}", file=sys.stderr, flush=True)
             short = story if asked.no_shrink else shrink(story, wrong)
             failed.append({"seed": seed, "wrong": str(wrong), "story": short})
+        for text in clocks.add(played.errors):
+            print(f"seed {asked.seed} to {seed}: {text}", file=sys.stderr, flush=True)
+            failed.append({"seed": seed, "wrong": text, "story": None})
         seed += asked.every
         if over():
-            return _result(hashes, failed, rig_s, time.monotonic() - began)
+            result = _result(hashes, failed, rig_s, passed_s, time.monotonic() - began)
+            found = {name: [clocks.beyond[name], count] for name, count in clocks.all.items()}
+            return {**result, "clocks_beyond_their_interval": found}
+
+
+class Clocks:
+    """Errors of clocks over all stories: each may be beyond its 95 % interval, five of 100 may be.
+
+    Attributes:
+        beyond, all: numbers of clocks by device.
+    """
+
+    SHARE, CHANCE = 0.05, 1e-6
+
+    def __init__(self) -> None:
+        self.beyond: Counter[str] = Counter()
+        self.all: Counter[str] = Counter()
+        self._said: set[str] = set()
+
+    def add(self, errors: list[tuple[str, float]]) -> list[str]:
+        """Add a story's; return for which devices there are too many by now, each once."""
+        from scipy.stats import binom
+
+        for device, share in errors:
+            self.all[device] += 1
+            self.beyond[device] += share > 1
+        found = [
+            device
+            for device, count in self.all.items()
+            if binom.sf(self.beyond[device] - 1, count, self.SHARE) < self.CHANCE
+        ]
+        new = [device for device in found if device not in self._said]
+        self._said |= {*new}
+        return [
+            f"clocks are as exact as they say: {self.beyond[device]} of {self.all[device]} clocks "
+            f"of {device} are beyond their 95 % interval"
+            for device in new
+        ]
 
 
 def _result(
-    hashes: dict[int, str], failed: list[dict[str, Any]], rig_s: float, took_s: float
+    hashes: dict[int, str],
+    failed: list[dict[str, Any]],
+    rig_s: float,
+    passed_s: float,
+    took_s: float,
 ) -> dict[str, Any]:
     return {
         "stories": len(hashes),
         "campaign_hours": round(rig_s / 3600, 3),
+        "hours_with_pauses": round(passed_s / 3600, 3),
         "minutes": round(took_s / 60, 2),
         "hours_an_hour": round(rig_s / took_s, 1),
         "hours_a_processor_hour": round(rig_s / max(_processor_s(), 1e-9), 1),
@@ -148,7 +195,8 @@ def _words(result: dict[str, Any]) -> str:
     lines += [f"{name}: {found}" for name, found in result.get("plants", {}).items()]
     if "stories" in result:
         lines.append(
-            f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours, "
+            f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours "
+            f"({result['hours_with_pauses']:.0f} with pauses), "
             f"{result['hours_an_hour']:.0f} an hour ({result['hours_a_processor_hour']:.0f} of a "
             f"processor's), {len(failed)} failed"
         )
@@ -185,18 +233,23 @@ def _jobs(asked: argparse.Namespace) -> dict[str, Any]:
     parts = [json.loads(each.communicate()[0]) for each in running]
     hashes = {int(seed): value for part in parts for seed, value in part["hashes"].items()}
     failed = [it for part in parts for it in part["failed"]]
-    rig_s = 3600 * sum(part["campaign_hours"] for part in parts)
-    return _result(hashes, failed, rig_s, time.monotonic() - began)
+    rig_s, passed_s = (
+        3600 * sum(part[name] for part in parts) for name in ("campaign_hours", "hours_with_pauses")
+    )
+    return _result(hashes, failed, rig_s, passed_s, time.monotonic() - began)
 
 
 def _plants(asked: argparse.Namespace) -> dict[str, Any]:
     """Look for each planted defect by itself; `failed` are those that were not found."""
     from tests.storm.planted import PLANTS
+    from tests.storm.play import warm
 
+    warm()
     asked.no_shrink, found, missed = True, {}, []
     asked.minutes = asked.minutes or 5.0
     for name in PLANTS:
-        part = json.loads(_start(asked, plant=name).communicate()[0])
+        asked.plant = name
+        part = _forked(asked)
         seen = part["failed"][0] if part["failed"] else None
         said = None if seen is None else f"seed {seen['seed']}: {seen['wrong'][:120]}"
         found[name] = {"stories": part["stories"], "minutes": part["minutes"], "found": said}
@@ -204,6 +257,23 @@ def _plants(asked: argparse.Namespace) -> dict[str, Any]:
         if seen is None:
             missed.append({"seed": asked.seed, "wrong": f"{name} was not found", "story": None})
     return {"plants": found, "failed": missed}
+
+
+def _forked(asked: argparse.Namespace) -> dict[str, Any]:
+    """Play in a process that has all of this one's code, and ends with what was planted."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reader)
+        with os.fdopen(writer, "w") as file:
+            json.dump(_play(asked), file)
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        text = file.read()
+    os.waitpid(child, 0)
+    found: dict[str, Any] = json.loads(text)
+    return found
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,17 @@ from typing import Any
 import numpy as np
 
 from sliplab.flows.log import log_entries
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.status import StatusReader
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import read_json
+from sliplab.storage.files import is_temporary, read_json
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
-from sliplab.storage.trials.checksums import incomplete
+from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import FORGIVEN, Campaign, Store
 from sliplab.storage.trials.verify import content_problems, verify_trial
+from tests.storm.sent import Column, differences
 from tests.storm.steps import NAME
 
 LATER = {"cause.json"}
@@ -47,15 +50,29 @@ class Ledger:
 
     Args:
         folder: of the store.
+        request: whose plan is collected.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, request: RunRequest) -> None:
         self._folder, self._campaign = folder, folder / "campaigns" / NAME
+        self._plan = {trial.id: trial for trial in request.plan}
+        self._describe = request.plan.describe
+        self._retakes = request.plan.protocol.collection.gates.retakes
+        gate = request.plan.protocol.collection.gates.reference
+        self._drift_percent = None if gate is None else float(gate.event_rate)
+        self._rates: dict[str, float] = {}
+        self._skin = request.rig.skin.serial
+        self._skins: dict[str, str] = {}
+        self._sent: dict[str, dict[str, Column]] = {}
+        self._takes: dict[str, list[Sums]] = {}
+        self._pulled: dict[str, Sums] = {}
+        self.spoilt: set[str] = set()
+        self.errors: list[tuple[str, float]] = []
         self.trials: dict[str, Sums] = {}
         self.aside: dict[str, Sums] = {}
         self.imported: dict[str, Sums] = {}
         self.files: Sums = {}
-        self.damaged: set[str] = set()
+        self.damaged: dict[str, tuple[str, Sums]] = {}
         self.owed: set[str] = set()
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
@@ -82,10 +99,13 @@ class Ledger:
             return
         try:
             aside = self._folders("quarantine")
+            before = {*self.trials}
             self._check_aside(aside)
             self._check_trials(aside)
+            self._check_references(before, notes)
             self._check_recorded(notes, ended)
             self._check_imported(notes)
+            self._check_copies(notes)
             self._check_journals()
             self._check_status()
         except (OSError, ValueError, KeyError, StoreError) as error:
@@ -99,17 +119,24 @@ class Ledger:
             if note.get("asked") == "again" or note.get("asks") == "again":
                 self.again.update(note["trials"])
             if "damaged" in note:
-                self.damaged.add(note["damaged"])
-                self._status = None  # one that is kept reads a trial once
+                self.damaged[note["damaged"]] = note["how"], {}
+            if "spoilt" in note:
+                self.spoilt.add(note["spoilt"])
+            if "begins" in note:
+                self._skins[note["begins"]] = self._skin
+            if "recorded" in note:
+                self._sent[note["recorded"]] = note["sent"]
             if "logged" in note:
                 self.logged.append(note["logged"])
+                self._skin = note.get("skin", self._skin)
             if "number" in note:
                 self.asked[note["number"]] = note["asked"]
 
     # -- trials ----------------------------------------------------------------------------
 
     def _sums(self, folder: Path) -> Sums:
-        return {path.name: self._sum(path) for path in sorted(folder.iterdir())}
+        files = (path for path in sorted(folder.iterdir()) if not is_temporary(path.name))
+        return {path.name: self._sum(path) for path in files}
 
     def _sum(self, path: Path) -> str:
         about = path.stat()
@@ -151,17 +178,37 @@ class Ledger:
         for name in sorted(now.keys() - moving):
             if self.trials.get(name) == now[name]:
                 continue
-            if name in self.damaged and incomplete(self._campaign / "trials" / name):
-                continue
-            self.damaged.discard(name)
-            self._check_new(name)
+            if name in self.damaged:
+                how, sums = self.damaged.pop(name)
+                if sums in ({}, now[name]):
+                    self.damaged[name] = how, now[name]
+                    continue
+            self._check_new(name, aside)
+            self._takes.setdefault(name, []).append(now[name])
         self.trials = {name: now[name] for name in now.keys() - moving}
+        self.damaged = {name: how for name, how in self.damaged.items() if name in self.trials}
 
-    def _check_new(self, name: str) -> None:
+    def _check_new(self, name: str, aside: dict[str, Sums]) -> None:
         folder = self._campaign / "trials" / name
         for problem in verify_trial(folder):
             raise Wrong("what is committed is whole", f"{name}: {problem.what}")
-        record = Recording(folder).record
+        for text in differences(folder, self._sent[name]):
+            raise Wrong("what was sent is stored", f"{name}: {text}")
+        recording = Recording(folder)
+        record = recording.record
+        trial = self._plan[name]
+        start_us, end_us = recording.step("hold")
+        self._rates[name] = len(recording.events(start_us, end_us)) / (end_us - start_us)
+        states = record.trial, record.seed, json.dumps(record.condition, default=str)
+        if states != (name, trial.seed, json.dumps(self._describe(trial), default=str)):
+            raise Wrong("a record is true", f"{name}: states {states}")
+        attempts = [each for each in self._causes(name) if each.startswith(("gate", "again"))]
+        if record.attempt != len(attempts):
+            what = f"{name}: is attempt {record.attempt} after {len(attempts)}"
+            raise Wrong("a record is true", what)
+        skin = read_json(folder / PROVENANCE).get("skin")
+        if skin != self._skins[name]:
+            raise Wrong("a record is true", f"{name}: skin {skin}, {self._skins[name]} was logged")
         if not record.simulated or not Campaign(self._campaign).info["simulated"]:
             raise Wrong("nothing simulated is unmarked", name)
         for gate, found in record.quality.gates.items():
@@ -175,9 +222,37 @@ class Ledger:
             if not len(pairs) or clock.grade == "host arrival" or clock.uncertainty_ns is None:
                 continue
             error = np.abs(np.asarray(clock.map.to_reference(pairs[:, 0])) - pairs[:, 1]).max()
+            if clock.kind == "95 %":
+                self.errors.append((device, float(error / clock.uncertainty_ns)))
             if error > TIMES.get(clock.kind or "", 1.0) * clock.uncertainty_ns + 1:
                 what = f"{name}: {device} is {error:.0f} ns off, stated {clock.uncertainty_ns:.0f}"
                 raise Wrong("no time is wrong beyond its interval", what)
+
+    def _check_references(self, before: set[str], notes: list[dict[str, Any]]) -> None:
+        """Nothing is taken after a reference trial that has drifted.
+
+        Args:
+            before: trials that were committed before this step.
+        """
+        if self._drift_percent is None or any("again" in note.values() for note in notes):
+            return
+        references = [name for name, each in self._plan.items() if each.role == "reference"]
+        known = [name for name in references if name in before]
+        if not {*known} <= self.trials.keys():
+            return
+        drifted = ""
+        for note in notes:
+            name = note.get("trial", "")
+            if note.get("outcome") == "committed" and name in references:
+                known.append(name)
+            skin = self._skins.get(known[-1]) if known else None
+            alike = [each for each in known if self._skins[each] == skin]
+            if len(alike) > 1:
+                first, last = self._rates[alike[0]], self._rates[alike[-1]]
+                far = 100 * abs(last / first - 1) > 1.2 * self._drift_percent
+                drifted = alike[-1] if far else ""
+            if drifted and "begins" in note and skin == self._skin:
+                raise Wrong("a drifted reference ends the night", f"{note['begins']} after it")
 
     def _check_recorded(self, notes: list[dict[str, Any]], ended: bool) -> None:
         """What was recorded completely is kept; what was not finished is at least set aside."""
@@ -185,16 +260,24 @@ class Ledger:
         folder = self._campaign / "incoming"
         incoming = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         for name, sums in self.unfinished.items():
-            if name in incoming or self._recovered(name, sums):
-                continue
-            causes = self._set_aside(name)
-            if len(causes) <= self.counts[name]:
-                raise Wrong("nothing complete is thrown away", f"incoming/{name} is gone")
-            if name in self.owed and not causes[-1].startswith(("gate", "again")):
+            new = self._causes(name)[self.counts[name] :]
+            # it may be taken again at once, which in a simulation gives the same data
+            if name in self.owed and any(not each.startswith(("gate", "again")) for each in new):
                 raise Wrong("nothing complete is thrown away", f"{name} had its record")
+            if name not in incoming and not self._recovered(name, sums) and not new:
+                raise Wrong("nothing complete is thrown away", f"incoming/{name} is gone")
         self.unfinished = {name: self._sums(folder / name) for name in incoming}
         self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
         self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
+        failed = Counter(
+            item["trial"]
+            for item in Campaign(self._campaign).quarantined()
+            if str(item["cause"]).startswith("gate") and FORGIVEN not in item
+        )
+        for name, count in failed.items():
+            if count > self._retakes + 1:
+                what = f"{name} failed {count} times, {self._retakes} retakes are allowed"
+                raise Wrong("a failed trial is retaken as often as planned", what)
         for note in notes:
             if note.get("outcome") == "committed" and note["trial"] not in kept:
                 raise Wrong("nothing committed is lost or changed", f"{note['trial']} was reported")
@@ -217,7 +300,36 @@ class Ledger:
                 raise Wrong("what is committed is whole", f"copied/{name}: {problem.what}")
         self.imported = now
 
-    def _set_aside(self, trial: str) -> list[str]:
+    def _check_copies(self, notes: list[dict[str, Any]]) -> None:
+        """What the remote store shows is there in whole; what was pulled is a trial of ours."""
+        remote = self._folder.parent / "remote" / "campaigns" / NAME
+        shown: dict[str, dict[str, str]] = {}
+        for path in sorted((remote / "trials").glob("*.json")):
+            files = {name: known["sha256"] for name, known in read_json(path)["files"].items()}
+            shown[path.stem] = files
+            for name, sha in files.items():
+                here = remote / "objects" / sha
+                if sha in self.spoilt:
+                    if here.exists() and self._sum(here) == sha:
+                        self.spoilt.discard(sha)
+                elif not here.exists() or self._sum(here) != sha:
+                    raise Wrong("what is pushed is whole", f"{path.stem}/{name}")
+        folder = self._folder.parent / "pulled" / "campaigns" / NAME / "trials"
+        now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
+        for name, sums in now.items():
+            if self._pulled.get(name) != sums and sums not in self._takes.get(name, ()):
+                raise Wrong("what is pulled is whole", name)
+        self._pulled = now
+        for note in notes:
+            if "pushed" in note and not note["problems"]:
+                for name, sums in self.trials.items():
+                    if name not in self.damaged and shown.get(name) != sums:
+                        raise Wrong("what is reported is done", f"{name} was not pushed")
+            if "pulled" in note and not note["problems"]:
+                for name in shown.keys() - now.keys():
+                    raise Wrong("what is reported is done", f"{name} was not pulled")
+
+    def _causes(self, trial: str) -> list[str]:
         return [
             str(item["cause"])
             for item in Campaign(self._campaign).quarantined()
@@ -264,7 +376,8 @@ class Ledger:
         if one.problem is not None:
             raise Wrong("a status is true", one.problem.replace(str(self._folder), ""))
         out = {item["trial"] for item in one.excluded}
-        there = self.trials.keys() - self.damaged
+        cut = {name for name, (how, _) in self.damaged.items() if how == "cut"}
+        there = self.trials.keys() - cut  # a changed byte is found by `verify` only
         counts = (one.committed, one.planned - one.missing - len(out), one.simulated)
         if counts != (len(there), len(there), True):
             raise Wrong("a status is true", f"says {counts}, there are {len(there)}")
@@ -273,6 +386,9 @@ class Ledger:
         if by_person != skipped:
             what = f"{sorted(by_person)} are skipped, asked and answered were {sorted(skipped)}"
             raise Wrong("requests are carried out", what)
+        both = [kind for _, kind in sorted(self.asked.items()) if kind in {"pause", "resume"}]
+        if (found.paused is not None) != (both[-1:] == ["pause"]):
+            raise Wrong("a status is true", f"says it is paused: {found.paused}, asked was {both}")
 
     def _skipped(self) -> set[str]:
         """Return the trials that were skipped, by the requests and their answers."""

@@ -12,11 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis import quality
+from sliplab.analysis import quality, references
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows import status
 from sliplab.flows.collecting import live_feed, requests, session, supervisor, watches
-from sliplab.rigs.core import guard, motion_watch, rig
+from sliplab.flows.server import runs, schedules
+from sliplab.rigs.core import force_watch, guard, motion_watch, rig
 from sliplab.rigs.core.capabilities import ArmState
 from sliplab.storage import files
 from sliplab.storage.remote import objects, pull
@@ -288,3 +289,144 @@ def incomplete_counts() -> None:
     """A committed trial that lost a file still counts as one."""
     checksums.incomplete = lambda folder: None  # type: ignore[assignment]
     store.incomplete = lambda folder: None  # type: ignore[attr-defined]
+
+
+# -- a second set: defects that came to mind after the storm was written ---------------------------
+
+
+@plant
+def chunk_lost() -> None:
+    """Every fortieth chunk of a trial is not written."""
+    add, seen = writer.TrialWriter.add, [0]
+
+    def losing(self: writer.TrialWriter, device: str, chunk: Any) -> None:
+        seen[0] += 1
+        if seen[0] % 40:
+            add(self, device, chunk)
+
+    writer.TrialWriter.add = losing  # type: ignore[method-assign]
+
+
+@plant
+def zero_by_feel() -> None:
+    """Depth zero is where the touch was detected, and not where it began."""
+    touch = rig.Rig.touch_off
+    rig.Rig.touch_off = lambda self, *given: touch(self, *given) + 0.3  # type: ignore[method-assign]
+
+
+@plant
+def skin_once() -> None:
+    """A skin that is logged during a night counts from the next one on."""
+    made = session.LoggedContext
+
+    class Once(made):  # type: ignore[misc,valid-type]
+        def read(self) -> dict[str, str]:
+            if not hasattr(self, "_once"):
+                self._once = super().read()
+            return dict(self._once)
+
+    session.LoggedContext = Once  # type: ignore[misc]
+
+
+@plant
+def attempts_forgotten() -> None:
+    """Each session begins to number a trial's attempts anew, so that their seeds repeat."""
+    store.Campaign.attempts = lambda self: {}  # type: ignore[method-assign]
+
+
+@plant
+def retakes_forgotten() -> None:
+    """Failed attempts of earlier sessions do not count."""
+    store.Campaign.failed_attempts = lambda self: {}  # type: ignore[method-assign]
+
+
+@plant
+def window_open() -> None:
+    """A trial begins although the window is over."""
+    supervisor.CollectionSupervisor._check_window = nothing  # type: ignore[method-assign]
+
+
+@plant
+def nan_passes() -> None:
+    """A pose that is no number is taken for one inside the limits."""
+    watch = guard.Guard.check_measured
+
+    def watching(self: guard.Guard, pose: Any, *given: Any, **named: Any) -> None:
+        if pose.xyz_mm[2] == pose.xyz_mm[2]:
+            watch(self, pose, *given, **named)
+
+    guard.Guard.check_measured = watching  # type: ignore[method-assign]
+    rig.check_pose = lambda pose: pose  # type: ignore[attr-defined]
+
+
+@plant
+def stall_unseen() -> None:
+    """An arm whose pose does not change any more is not stopped."""
+    motion_watch.STUCK_S = 1e9  # type: ignore[misc]
+
+
+@plant
+def silence_passes() -> None:
+    """A force sensor with a limit may be silent."""
+    force_watch.SILENT_S = 1e9  # type: ignore[misc]
+
+
+@plant
+def drift_passes() -> None:
+    """A reference trial that has drifted does not end the night."""
+    references.ReferenceDrift.beyond = property(lambda self: False)  # type: ignore[assignment,method-assign]
+
+
+@plant
+def interval_third() -> None:
+    """The stated uncertainty of a clock is a third of what it is: too little for one trial."""
+    made = synchronise.DeviceSync.record
+    synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
+        replace(self, uncertainty_ns=self.uncertainty_ns / 3)
+    )
+
+
+@plant
+def sizes_only() -> None:
+    """A file with all its bytes is taken for unchanged."""
+    checksums.Checksum.problem = lambda self, path: self.size_problem(path)  # type: ignore[method-assign]
+
+
+@plant
+def remote_trusted() -> None:
+    """What is at the URL is taken for what was sent, by its size."""
+    objects.Remote.matches = lambda self, key, known, *more: self.size(key) == known.bytes  # type: ignore[method-assign]
+
+
+@plant
+def hold_short() -> None:
+    """A wait ends after nine tenths of its time."""
+    wait = rig.Rig.wait
+    rig.Rig.wait = lambda self, seconds, sink=None: wait(self, 0.9 * seconds, sink)  # type: ignore[method-assign]
+
+
+@plant
+def run_lost() -> None:
+    """A run whose begin the page took, and answered too late, stays pending."""
+    begin = runs.ServedRuns._begin
+
+    async def forgetting(self: runs.ServedRuns, client: Any, run: Any) -> None:
+        try:
+            await begin(self, client, run)
+        finally:
+            self._asked = None
+
+    runs.ServedRuns._begin = forgetting  # type: ignore[method-assign]
+
+
+@plant
+def killed_early() -> None:
+    """A run that is to stop is killed before its arm can be at rest."""
+    runs.STOP_LIMIT_S = 3.0  # type: ignore[misc]
+
+
+@plant
+def window_in_utc() -> None:
+    """The end of a window is taken by the clock of Greenwich."""
+    end = schedules.window_end
+    schedules.window_end = lambda due, until, zone: end(due, until, "UTC")  # type: ignore[assignment]

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from tests.crash.process import End, live
 from tests.storm.ledger import Ledger, Wrong
 from tests.storm.steps import NAME, Process, Stage
 from tests.storm.story import Story, shorter
-from tests.storm.virtual import BEGIN_S, Host, Notes
+from tests.storm.virtual import BEGIN_S, Host, Notes, modules_with_dates
 
 NIGHT_GAP_S = 8 * 3600.0
 MOST_SHORTER = 60
@@ -46,11 +47,15 @@ class Played:
     Attributes:
         trace: what happened, line by line; the same for the same story.
         rig_s: virtual time of the rig.
+        passed_s: virtual time of nights, with the pauses that were stepped through.
+        errors: of clocks with a 95 % interval, as a share of it, by device.
         wrong: the invariant that was broken, and how; None if all held.
     """
 
     trace: list[str] = field(default_factory=list)
     rig_s: float = 0.0
+    passed_s: float = 0.0
+    errors: list[tuple[str, float]] = field(default_factory=list)
     wrong: Wrong | None = None
 
     @property
@@ -64,16 +69,23 @@ class PowerCut:
 
     Args:
         before: the disk when the process began. after: where what is left is put.
+        name: part of the paths whose changes are counted.
     """
 
-    def __init__(self, before: Disk, after: Path, at: int, torn: int | None) -> None:
+    def __init__(
+        self, before: Disk, after: Path, at: int, torn: int | None, name: str = ""
+    ) -> None:
         self._before, self._after, self._at, self._torn = before, after, at, torn
+        self._name, self._seen = name, 0
         self._recorder = Recorder()
 
     def __call__(self, call: Call) -> int:
         """Make the call; the last one ends the process."""
+        before = len(self._recorder.done)
         result = self._recorder(call)
-        if len(self._recorder.done) >= self._at:
+        if self._name in f"{call.path} {call.to}":
+            self._seen += len(self._recorder.done) - before
+        if self._seen >= self._at:
             self.cut()
         return result
 
@@ -114,10 +126,10 @@ class Player:
     def __init__(self, folder: Path, story: Story) -> None:
         self._stage = Stage(folder, story)
         self._stage.data.mkdir(parents=True)
-        _ = self._stage.trials  # read once, for all processes
-        self._ledger = Ledger(self._stage.store)
+        self._ledger = Ledger(self._stage.store, self._stage.calm)
         self._notes = Notes(folder / "notes")
         self._wall_s = BEGIN_S
+        self._text = ""
         self.played = Played()
 
     def play(self) -> Played:
@@ -129,6 +141,7 @@ class Player:
         except Wrong as wrong:
             self.played.wrong = wrong
             self.played.trace.append(str(wrong))
+        self.played.errors = self._ledger.errors
         return self.played
 
     def _step(self, name: str, step: dict[str, Any]) -> str:
@@ -137,13 +150,15 @@ class Player:
         host = Host(self._wall_s + NIGHT_GAP_S, notes, free)
 
         policy = _policy(weather, stage)
+        if step["do"] == "serve":
+            import_module("tests.storm.page")  # here, once for all processes
 
         def work() -> None:
             host.install()
             try:
                 Process(stage, host, notes).run(step)
             finally:
-                notes.add(wall_s=host.wall_s, rig_s=host.rig_s)
+                notes.add(wall_s=host.wall_s, rig_s=host.rig_s, passed_s=host.passed_s)
             if isinstance(policy, PowerCut):
                 policy.cut()
 
@@ -157,15 +172,17 @@ class Player:
         found = notes.take()
         self._wall_s = next((n["wall_s"] for n in found if "wall_s" in n), host.wall_s)
         self.played.rig_s += sum(note.get("rig_s", 0.0) for note in found)
+        self.played.passed_s += sum(note.get("passed_s", 0.0) for note in found)
         how = next((note["end"] for note in found if "end" in note and not end.killed), "killed")
-        text = next((note["text"] for note in found if "text" in note), "")
+        text = self._text = next((note["text"] for note in found if "text" in note), "")
         self.played.trace += [f"{name}: {json.dumps(note)}" for note in found]
         self._check_end(step, end, found, how, text)
+        damaged = {*self._ledger.damaged}
         self._ledger.look(found, how != "killed")
         if step["do"] == "verify" and (Store.exists(stage.store)):
             said = {note["found"] for note in found if "found" in note}
-            if said != self._ledger.damaged:
-                what = f"names {sorted(said)}, damaged are {sorted(self._ledger.damaged)}"
+            if said != damaged:
+                what = f"names {sorted(said)}, damaged are {sorted(damaged)}"
                 raise Wrong("verify names what is damaged, and nothing else", what)
         state = self._ledger
         self.played.trace.append(f"{name}: {how}; {sorted(state.trials)}; {sorted(state.aside)}")
@@ -180,25 +197,29 @@ class Player:
             if "wrong" in note:
                 raise Wrong(note["wrong"], note["what"])
         weather = step.get("weather", {})
+        lies = any("lie" in event for event in step.get("events", ()))
         if how == "killed" and not ({"kill", "power"} & weather.keys() and end.killed):
             raise Wrong("errors are explained", f"ended with {end.code}: {end.said[-300:]}")
         why = {
             "done": True,
             "killed": True,
             "stopped": any("signal" in n or n.get("asked") == "stop" for n in notes),
-            "CampaignStopped": bool("low" in weather or "paused" in text),
-            "RigError": bool(step.get("faults") or weather),
-            "ArmFault": bool(step.get("faults")),
-            "GuardError": bool(step.get("faults")),
+            "CampaignStopped": bool("low" in weather or "paused" in text or "drifted" in text),
+            "WindowOver": "window_s" in step,
+            "RigError": bool(step.get("faults") or weather or lies),
+            "ForceLimitError": bool(step.get("faults") or lies),
+            "ArmFault": bool(step.get("faults") or lies),
+            "GuardError": bool(step.get("faults") or lies),
             "StoreError": bool(weather) or _has(step, "disk_full"),
             "OSError": bool(weather),
-            "RemoteError": bool(step.get("fails") or weather),
+            "RemoteError": bool(step.get("fails") or weather or self._ledger.spoilt),
+            "RemoteDamaged": bool(step.get("short") or self._ledger.spoilt),
             # an earlier push was ended before its first trial
             "NoPushedStore": step["do"] == "pull",
             "RemoteMissing": step["do"] == "pull",
         }
         kind = "GuardError" if text.startswith("arm: ") else how
-        if (kind == "GuardError" and not step.get("faults")) or not why.get(kind, False):
+        if (kind == "GuardError" and not (step.get("faults") or lies)) or not why.get(kind, False):
             raise Wrong("errors are explained", f"{how}: {text[:300]}")
 
     def _settle(self) -> None:
@@ -208,9 +229,13 @@ class Player:
             Wrong: it does not.
         """
         self._step("end resume", {"do": "ask", "ask": "resume"})
-        for _ in range(3):
+        self._step("end verify", {"do": "verify", "quarantine": True})
+        for _ in range(6):
             if (how := self._step("end night", {"do": "night"})) == "done":
                 break
+            if "drifted" in self._text:  # both are given again, as it says
+                again = [n for n, trial in enumerate(self._stage.trials) if trial in self._text]
+                self._step("end again", {"do": "ask", "ask": "again", "trials": again})
         if how != "done":
             raise Wrong("what a message advises works", f"a calm night ended: {how}")
         if (self._stage.folder / "one.h5").exists():  # what an import has left, it clears up
@@ -220,13 +245,12 @@ class Player:
             what = f"{problem.path}: {problem.what}".replace(str(self._stage.folder), "")
             raise Wrong("nothing is damaged", what)
         campaign = store.campaign(NAME)
-        request = self._stage.request([])
-        if request.due_trials(campaign):
+        if self._stage.calm.due_trials(campaign):
             raise Wrong("what a message advises works", "trials are left after a calm night")
         litter = [*self._stage.store.rglob("*.tmp"), *(campaign.folder / "incoming").iterdir()]
         for path in litter:
             raise Wrong("nothing is left over", str(path.relative_to(self._stage.store)))
-        self._step("end push", {"do": "push", "fails": 0})
+        self._step("end push", {"do": "push", "fails": 0, "check": True})
         self._step("end pull", {"do": "pull", "fails": 0})
         pulled = self._stage.data / "pulled" / "campaigns" / NAME / "trials"
         there = {path.name: path for path in pulled.iterdir()} if pulled.is_dir() else {}
@@ -265,6 +289,7 @@ def warm() -> None:
         push(Store.open(data.store), remote)
         pull(remote, folder / "pulled")
     entries()
+    modules_with_dates()
     gc.collect()
     gc.freeze()  # or each forked process copies what it counts
 

@@ -7,7 +7,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -23,23 +23,24 @@ from sliplab.flows.collecting.requests import (
     store_lock,
 )
 from sliplab.flows.collecting.session import open_session, refresh
-from sliplab.flows.collecting.supervisor import SessionListener
+from sliplab.flows.collecting.supervisor import SessionListener, WindowOver
 from sliplab.flows.imports import import_data
 from sliplab.flows.log import add_note
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import stopping
+from sliplab.flows.verify import verify
 from sliplab.protocols import Trial
 from sliplab.protocols.errors import InputError
+from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.storage.errors import StoreError
 from sliplab.storage.remote import pull as pulling
-from sliplab.storage.remote.objects import Remote
+from sliplab.storage.remote.objects import Remote, RemoteError
 from sliplab.storage.remote.pull import pull
-from sliplab.storage.remote.push import push
+from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
 
@@ -71,18 +72,28 @@ class Stage:
         return self.data / "store"
 
     @cached_property
+    def calm(self) -> RunRequest:
+        """The request to collect on a rig without faults; read once, for all processes."""
+        return self.request([])
+
+    @cached_property
     def trials(self) -> tuple[str, ...]:
         """Ids of the planned trials, in their order."""
-        return tuple(trial.id for trial in self.request([]).plan)
+        return tuple(trial.id for trial in self.calm.plan)
 
-    def request(self, faults: list[dict[str, Any]], most: int | None = None) -> RunRequest:
+    def request(
+        self, faults: list[dict[str, Any]], most: int | None = None, until: float | None = None
+    ) -> RunRequest:
         """Return the request to collect on a rig with these faults."""
+        if not faults and "calm" in vars(self):
+            return replace(self.calm, most=most, until=until)
         rig = {**self.story["rig"]}
         rig["mock"] = {**rig["mock"], "faults": faults}
         files = {"protocol.yaml": self.story["protocol"], "rig.yaml": rig}
         for name, content in files.items():
             (self.folder / name).write_text(yaml.dump(content, Dumper=yaml.CSafeDumper))
-        return make_request(*(self.folder / name for name in files), self.store, most=most)
+        paths = (self.folder / name for name in files)
+        return make_request(*paths, self.store, most=most, until=until)
 
 
 @dataclass(frozen=True)
@@ -102,12 +113,17 @@ class Process:
             self.notes.add(end="done")
         except (KeyboardInterrupt, StopRequested):
             self.notes.add(end="stopped")
+        except WindowOver:
+            self.notes.add(end="WindowOver")
         except Exception as error:
             failed = failure(error)
             if failed.trace:
                 self.notes.add(wrong="errors are explained", what=self.scrubbed(repr(error)))
                 raise
             self.notes.add(end=type(error).__name__, text=self.scrubbed(failed.message))
+        for thread in threading.enumerate():
+            if thread is not threading.current_thread():
+                thread.join(0.5)  # a progress display's ends a little later
         left = _handles() - handles
         if left or threading.active_count() > threads:
             names = sorted(thread.name for thread in threading.enumerate())
@@ -152,11 +168,14 @@ class _Listener(SessionListener):
 def night(process: Process, step: dict[str, Any]) -> None:
     """Collect what is missing, while faults, people and weather have their way."""
     stage, host, notes = process.stage, process.host, process.notes
-    request = stage.request(step.get("faults", []), step.get("most"))
+    until = host.wall_s + step["window_s"] if "window_s" in step else None
+    request = stage.request(step.get("faults", []), step.get("most"), until)
     planned_s = sum(request.plan.seconds(trial) for trial in request.plan)
     host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
-    supervising.POLL_S = 300.0  # a pause of 12 hours is looked at less often
-    witness = Witness(request.rig, host, notes)
+    # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces
+    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.1
+    lies = any("lie" in event for event in step.get("events", ()))
+    witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or lies))
     witness.install()
     host.events = [
         (event["at_s"], partial(happen, process, event, witness))
@@ -198,6 +217,8 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
             os.kill(os.getpid(), getattr(signal, event["signal"]))
     elif "clock" in event:
         process.host.wall_s += event["clock"]
+    elif "lie" in event:
+        witness.lie.begin(event["lie"], event["seconds"])
     elif "rival" in event:
         try:
             with store_lock(Store.open(process.stage.store)):
@@ -260,27 +281,46 @@ def _log(process: Process, step: dict[str, Any]) -> None:
     if context and not store.campaign(NAME).begun:
         return
     add_note(store, text, who="anna", context=context)
-    process.notes.add(logged=text)
+    process.notes.add(logged=text, **(context or {}))
 
 
 def check(process: Process, step: dict[str, Any]) -> None:
-    """Verify the store: nothing is damaged."""
-    if Store.exists(process.stage.store):
-        for problem in verify(Store.open(process.stage.store)):
-            if problem.kind == "damaged":
-                what = process.scrubbed(f"{problem.path}: {problem.what}")
-                process.notes.add(found=problem.trial, what=what)
+    """Verify the store: what is damaged is named, and set aside if that is asked for."""
+    if not Store.exists(process.stage.store):
+        return
+    with stopping.signals():
+        found = verify(str(process.stage.store), quarantine=step.get("quarantine", False))
+    for problem in found["problems"]:
+        if problem.kind == "damaged":
+            what = process.scrubbed(f"{problem.path}: {problem.what}")
+            process.notes.add(found=problem.trial, what=what)
+    process.notes.add(quarantined=found["quarantined"])
 
 
 def damage(process: Process, step: dict[str, Any]) -> None:
-    """A disk loses the end of a committed trial's data."""
-    folder = process.stage.store / "campaigns" / NAME / "trials"
-    trials = sorted(folder.iterdir()) if folder.is_dir() else []
-    if trials:
-        trial = trials[step["trial"] % len(trials)]
-        process.notes.add(damaged=trial.name)
-        (trial / "data.h5").chmod(0o644)
-        os.truncate(trial / "data.h5", 1000)
+    """A disk loses the end of a file, or changes a byte of it."""
+    data, where, how = process.stage.data, step.get("where", "trials"), step.get("how", "cut")
+    if where == "remote":
+        files = sorted((data / "remote" / "campaigns" / NAME / "objects").glob("*"))
+        files = [path for path in files if path.stat().st_size > 1000]
+    else:
+        files = sorted((process.stage.store / "campaigns" / NAME / where).glob("*/data.h5"))
+    if not files:
+        return
+    path = files[step["trial"] % len(files)]
+    if where == "trials":
+        process.notes.add(damaged=path.parent.name, how=how)
+    elif where == "remote":
+        process.notes.add(spoilt=path.name)
+    path.chmod(0o644)
+    if how == "cut":
+        os.truncate(path, 1000)
+        return
+    with path.open("r+b") as file:
+        file.seek(-300, os.SEEK_END)
+        byte = file.read(1)[0]
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([byte ^ 0x55]))
 
 
 def bring(process: Process, step: dict[str, Any]) -> None:
@@ -296,38 +336,62 @@ def bring(process: Process, step: dict[str, Any]) -> None:
     process.notes.add(imported="one")
 
 
-def _remote(process: Process, fails: int) -> Remote:
-    """Return the URL of the copy, which fails at every so manieth object."""
+def _remote(process: Process, step: dict[str, Any]) -> Remote:
+    """Return the URL of the copy, which fails at every so manieth object, or reads it in part."""
+    fails, short = step["fails"], step.get("short", False)
     folder = process.stage.data / "remote"
     remote, seen = Remote(f"file://{folder}"), [0]
 
     def failing(real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
             seen[0] += 1
-            if fails and seen[0] % fails == 0:
+            if not fails or seen[0] % fails:
+                return real(*given, **named)
+            if not short:
                 raise OSError(5, "the network is gone")
-            return real(*given, **named)
+            found = real(*given, **named)
+            return found[: len(found) // 2]
 
         return call
 
-    for name in ("info", "open", "ls", "cat", "pipe_file", "rm_file"):
+    calls = ("cat_file",) if short else ("info", "open", "ls", "cat", "pipe_file", "rm_file")
+    for name in calls:
         setattr(remote._fs, name, failing(getattr(remote._fs, name)))
+    real_put = remote.put
+
+    def put(key: str, source: bytes | Path) -> None:
+        seen[0] += 1
+        if fails and not short and seen[0] % fails == 0:
+            raise RemoteError("the network is gone")
+        real_put(key, source)
+
+    remote.put = put  # type: ignore[method-assign]
     return remote
 
 
 def send(process: Process, step: dict[str, Any]) -> None:
     """Push the store."""
     if Store.exists(process.stage.store):
-        done = push(Store.open(process.stage.store), _remote(process, step["fails"]))
-        process.notes.add(pushed=done.pushed, problems=len(done.problems))
+        options = PushOptions(check=step.get("check", False))
+        remote = _remote(process, step)
+        done = push(Store.open(process.stage.store), remote, options=options)
+        process.notes.add(pushed=done.pushed, problems=len(done.problems), check=options.check)
 
 
 def fetch(process: Process, step: dict[str, Any]) -> None:
     """Pull what was pushed into another store."""
     if (process.stage.data / "remote").exists():
         pulling._AT_ONCE = 1  # one after another, in an order that the seed decides
-        done = pull(_remote(process, step["fails"]), process.stage.data / "pulled")
+        done = pull(_remote(process, step), process.stage.data / "pulled")
         process.notes.add(pulled=done.pulled, problems=len(done.problems))
+
+
+def serve(process: Process, step: dict[str, Any]) -> None:
+    """Runs are begun from a page, which gets lost and comes back."""
+    from tests.storm.page import serve  # loads Prefect
+
+    if Store.exists(process.stage.store):
+        serve(process.stage.store, process.notes, step["seed"], step["lost"])
 
 
 DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
@@ -339,5 +403,6 @@ DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "import": bring,
     "push": send,
     "pull": fetch,
+    "serve": serve,
 }
 """What each kind of step does."""

@@ -11,8 +11,10 @@ import random
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from sliplab.flows.planning.disk_space import RESERVE
 from tests.conftest import ROOT
 from tests.crash.campaign import protocol
+from tests.storm.lies import OF_ARM, OF_FORCE
 
 Story = dict[str, Any]
 Step = dict[str, Any]
@@ -56,6 +58,13 @@ FAULTS: dict[str, Draw] = {
     "stream_gone": lambda rng: {"stream": "warm"},
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
+NAMES = (
+    *("=1/data.h5", "=1/provenance.json", "=1/record.json", "=1/journal.jsonl"),
+    *("=1/checksums.json", "=1/checksums.json", "=1/.cause.json", "/trials", "/trials"),
+    *("/incoming", "/quarantine", "/campaign.json", "/bench", "/store.json", "/rig.yaml"),
+    *("/skipped.json", "/control", ".done.json", "/log", "/objects", "/remote/", "/pulled/"),
+)
+"""Parts of paths, each of which a kill or a power cut may wait for."""
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
@@ -69,10 +78,17 @@ def draw(seed: int) -> Story:
     story = {"seed": seed, "protocol": _protocol(rng), "rig": _rig(rng)}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
-    steps = []
-    for number in range(rng.randint(4, 8)):
+    steps: list[Step] = []
+    for number in range(rng.randint(8, 16)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
-        steps.append({"do": kind, **STEPS[kind][1](rng, story, trials)})
+        last = steps[-1] if steps else {}
+        ended = last.get("weather", {}).keys() & {"kill", "power"}
+        if (ended or last.get("do") in {"push", "damage"}) and rng.random() < 0.5:
+            kind = rng.choice(FOLLOWS.get(last["do"], ("verify",)))
+        step = {"do": kind, **STEPS[kind][1](rng, story, trials)}
+        if ended and kind == "damage" and last["do"] == "night":
+            step |= {"where": "incoming", "how": "cut"}
+        steps.append(step)
     return {**story, "steps": steps}
 
 
@@ -93,6 +109,10 @@ def _protocol(rng: random.Random) -> dict[str, Any]:
     rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
     both = {"warm_up": warm_up, "rezero": rezero}
     collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
+    if rng.random() < 0.3:
+        condition = {name: factors[name]["values"][0] for name in ("depth", "speed", "direction")}
+        collection["references"] = {"every": 2, "condition": condition}
+        collection["gates"]["reference"] = {"event_rate": rng.choice(["20 %", "60 %"])}
     return data
 
 
@@ -146,13 +166,16 @@ def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
         return {}
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
-    cut = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
+    cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
+    if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
+        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": rng.choice(NAMES)}
+        cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
     drawn: list[Step] = [
         {"kill": {**kill, "share": rng.choice([0.0, 0.3, 1.0])}},
         {"power": {**cut, "torn": rng.choice([None, rng.randrange(1000)])}},
         {"full": full},
-        {"low": {"free": rng.choice([0, 150_000_000])}},
+        {"low": {"free": rng.choice([0, 150_000_000, RESERVE + 2000, RESERVE + 20_000])}},
         {"read_only": {}},
     ]
     made = rng.choices(drawn, [4, 4, 2, 1, 1])[0]
@@ -178,36 +201,68 @@ def _event(rng: random.Random, story: Story, trials: int) -> Step:
             {"log": {}},
             {"clock": rng.choice([-7200, -3, 40, 90_000])},
             {"rival": True},
+            _lie(rng, story),
         ]
     )
     return {"at_s": round(rng.uniform(0, 130), 2), **made}
 
 
+def _lie(rng: random.Random, story: Story) -> Step:
+    limited = "force" in story["rig"]["limits"]
+    kinds = (*OF_ARM, *OF_FORCE, *OF_FORCE) if limited else OF_ARM
+    return {"lie": rng.choice(kinds), "seconds": rng.choice([1.5, 20.0, 1e9])}
+
+
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
     events = [_event(rng, story, trials) for _ in range(rng.choice([0, 1, 2, 3]))]
+    window = {"window_s": round(rng.uniform(0, 200), 1)} if rng.random() < 0.15 else {}
     return {
         "faults": _faults(rng, story),
         "events": sorted(events, key=lambda event: event["at_s"]),
-        "most": rng.choice([None, None, 2]),
+        "most": rng.choice([None, None, 1, 2]),  # so that later nights have trials left
+        **window,
         **_weather(rng),
     }
+
+
+def _damage(rng: random.Random, story: Story, trials: int) -> Step:
+    where = rng.choice(["trials", "trials", "incoming", "remote"])
+    how = "cut" if where == "incoming" else rng.choice(["cut", "flip"])
+    return {"trial": rng.randrange(trials), "where": where, "how": how}
+
+
+def _copy(rng: random.Random, story: Story, trials: int) -> Step:
+    step = {"fails": rng.choice([0, 0, 2, 3, 5, 9]), "short": rng.random() < 0.3}
+    return {**step, "check": rng.random() < 0.2, **_weather(rng)}
 
 
 def _between(rng: random.Random, story: Story, trials: int) -> Step:
     return {**_ask(rng, story, trials), **_weather(rng, 0.2)}
 
 
+def _serve(rng: random.Random, story: Story, trials: int) -> Step:
+    return {"seed": rng.randrange(10_000), "lost": rng.choice([0.0, 0.1, 0.4])}
+
+
 STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
-    "night": (5, _night),
+    "night": (4, _night),
     "ask": (2, _between),
     "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
-    "verify": (0.5, lambda rng, story, trials: {}),
-    "damage": (0.3, lambda rng, story, trials: {"trial": rng.randrange(trials)}),
+    "verify": (0.5, lambda rng, story, trials: {"quarantine": rng.random() < 0.5}),
+    "damage": (1, _damage),
     "import": (0.5, lambda rng, story, trials: _weather(rng)),
-    "push": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
-    "pull": (1, lambda rng, story, trials: {"fails": rng.choice([0, 0, 3, 9]), **_weather(rng)}),
+    "push": (2, _copy),
+    "pull": (2, _copy),
+    "serve": (1, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
+FOLLOWS = {
+    "night": ("night", "verify", "damage", "damage", "push", "ask"),
+    "push": ("pull", "pull", "push", "damage"),
+    "pull": ("pull", "push", "damage"),
+    "damage": ("verify", "night", "push", "pull"),
+}
+"""What often follows a step that ended in a kill or a power cut, or changed what others read."""
 
 
 def shorter(story: Story) -> Iterator[Story]:

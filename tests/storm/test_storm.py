@@ -49,5 +49,5 @@ def test_a_seed_is_one_story_with_one_trace() -> None:
 
 
 def test_a_planted_defect_is_found() -> None:
-    found = storm("--plant=retracts_fast", "--stories=1", "--no-shrink")
+    found = storm("--plant=hold_short", "--stories=1", "--no-shrink")
     assert found["failed"] != []

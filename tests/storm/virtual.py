@@ -10,7 +10,9 @@ import sys
 import time
 from collections import namedtuple
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from sliplab.rigs.mock.world import SimulatedWorld
@@ -43,6 +45,13 @@ class Notes:
         return found
 
 
+@cache
+def modules_with_dates() -> list[ModuleType]:
+    """Return the program's modules that ask for dates; found once, for all processes."""
+    loaded = [module for name, module in sys.modules.items() if name.startswith("sliplab")]
+    return [module for module in loaded if vars(module).get("datetime") is real.datetime]
+
+
 class Host:
     """A host whose time passes only where the simulated rig waits, or the collection does.
 
@@ -67,9 +76,8 @@ class Host:
             def now(cls, tz: real.tzinfo | None = None) -> Datetime:
                 return cls.fromtimestamp(host.wall_s, tz)
 
-        for name, module in list(sys.modules.items()):
-            if name.startswith("sliplab") and getattr(module, "datetime", None) is real.datetime:
-                module.datetime = Datetime  # type: ignore[attr-defined]
+        for module in modules_with_dates():
+            module.datetime = Datetime  # type: ignore[attr-defined]
         time.time = lambda: host.wall_s
         shutil.disk_usage = lambda folder: _Usage(10**12, 10**12 - host.free, host.free)  # type: ignore[assignment,misc]
         pass_time = SimulatedWorld.pass_time

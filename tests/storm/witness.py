@@ -11,18 +11,32 @@ import numpy as np
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.protocols import Plan, Trial
+from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmState, Segment
+from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials import control
+from tests.storm.lies import Lie
+from tests.storm.sent import Tee
 from tests.storm.virtual import Host, Notes
 
 PLATE_MM = 1.0
 """How far the true plate may lie from the taught one, with its tilt over the reach."""
 SLACK_S = 0.3
 """Beyond one poll, until a fault that the poses show has stopped the arm."""
+STUCK_S, STUCK_MM = 3.0, 0.5
+"""Time, and motion at the commanded speed, until a pose that does not change stops the arm."""
+SILENT_S = 0.5
+"""Until a force sensor that does not answer has stopped the arm."""
+ZERO_MM = 0.15
+"""How far depth zero may be from the true plate where nothing disturbs it."""
+WAIT_S = 0.05
+"""By how much a wait may be longer or shorter than planned."""
+PLACE_MM = 0.3
+"""How far a step may end from where it was to, where nothing disturbs it."""
 
 
 class Witness:
@@ -30,13 +44,20 @@ class Witness:
 
     Args:
         file: whose limits hold.
+        calm: no fault of a device disturbs where the arm is.
 
     Attributes:
         resumed: a pause has ended, and depth zero was not found since.
+        lie: what a device reports that is not so.
     """
 
-    def __init__(self, file: RigFile, host: Host, notes: Notes) -> None:
+    def __init__(self, file: RigFile, host: Host, notes: Notes, *, calm: bool) -> None:
         limits = file.limits
+        self._calm = calm
+        self.lie = Lie(lambda: host.passed_s)
+        self._lied_s: float | None = None
+        self._segment: Segment | None = None
+        self._misled = False
         self._depth_mm, self._reach_mm = float(limits.depth), float(limits.reach)
         self._speed_mm_s, self._poll_s = float(limits.speed), float(file.poll)
         self._host, self._notes = host, notes
@@ -60,10 +81,18 @@ class Witness:
         start, pass_time = MockArm.start, SimulatedWorld.pass_time
         run_trial: Any = Rig.run_trial
         rezero: Any = Rig.rezero
+        take_step: Any = Rig.take_step
+        self.lie.install()
 
         def starting(arm: MockArm, path: Sequence[Segment]) -> None:
             self._look_at_path(arm._world, path)
+            state = arm._world.arm_state
             start(arm, path)
+            if state is ArmState.PROTECTIVE_STOP:
+                self.wrong("no motion after a stop", f"it is sent on in {state.value}")
+            self._segment, self._lied_s = path[-1], None
+            # what is sent from a false pose goes to a false place, which nothing here can know
+            self._misled = self.lie.active in {"pose_away", "pose_frozen"}
 
         def passing(world: SimulatedWorld, ns: int) -> None:
             pass_time(world, ns)
@@ -71,40 +100,88 @@ class Witness:
 
         def rezeroing(rig: Rig, *given: Any) -> Any:
             self.resumed = False
-            return rezero(rig, *given)
+            found = rezero(rig, *given)
+            self._look_at_zero(rig)
+            return found
+
+        def stepping(rig: Rig, index: int, step: Any, at: Position, sink: Any) -> Any:
+            began_s = self._host.passed_s
+            times = take_step(rig, index, step, at, sink)
+            self._look_at_step(rig, step, at, self._host.passed_s - began_s)
+            return times
 
         def running(rig: Rig, program: Any, sink: Any, *more: Any, **named: Any) -> Any:
             if self.resumed and self._rezeroes:
                 self.wrong("a pause may change the rig", "depth zero is not found again after one")
             self.resumed = False
-            done = run_trial(rig, program, sink, *more, **named)
-            self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name)
+            tee = Tee(sink)
+            done = run_trial(rig, program, tee, *more, **named)
+            self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name, sent=tee.columns)
             return done
 
         MockArm.start = starting  # type: ignore[method-assign]
         SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
         Rig.run_trial = running  # type: ignore[method-assign]
         Rig.rezero = rezeroing  # type: ignore[method-assign]
+        Rig.take_step = stepping  # type: ignore[method-assign]
 
     def watch(self, supervisor: CollectionSupervisor, plan: Plan) -> None:
         """Watch what a collection is allowed between its trials."""
         self._rezeroes = plan.protocol.collection.maintenance.rezero is not None
         may_take = supervisor.may_take
 
+        store, campaign = supervisor._store, supervisor._campaign
+        until = supervisor._run_request.until
+        last = max((each.number for each in control.requests(store)), default=0)
+
         def asked(trial: Trial) -> bool:
             may = may_take(trial)
-            if may and (pause := control.paused(supervisor._store)) is not None:
+            if not may:
+                return may
+            self._notes.add(begins=trial.id)
+            if (pause := control.paused(store)) is not None:
                 self.wrong("requests are carried out", f"goes on in spite of a {pause.kind}")
-            if may and self._host.free < RESERVE:
+            if trial.id in control.skipped(campaign):
+                self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
+            if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
+                self.wrong("requests are carried out", "goes on in spite of a stop")
+            if until is not None and self._host.wall_s > until:
+                self.wrong("no trial begins outside its window", trial.id)
+            folders = campaign.folders("trials")
+            sizes = [sum(each.stat().st_size for each in path.iterdir()) for path in folders]
+            if self._host.free < RESERVE + 0.5 * min(sizes, default=0):
                 self.wrong("no trial begins on a full disk", f"{self._host.free} bytes are free")
             return may
 
         supervisor.may_take = asked  # type: ignore[method-assign]
 
+    def _look_at_zero(self, rig: Rig) -> None:
+        """Hold depth zero, which was just found, against the true plate."""
+        pose = rig.plate_frame.pose(Position(0.0, 0.0, 0.0))
+        off = float(_world(rig).plane.sensor(pose)[2])
+        if self._calm and not abs(off) <= ZERO_MM:
+            self.wrong("depth zero is the plate", f"it is {off:.3f} mm off")
+
+    def _look_at_step(self, rig: Rig, step: Any, at: Position, took_s: float) -> None:
+        """Hold where the arm truly is, and how long it took, against the step it has taken."""
+        if not self._calm:
+            return
+        if not isinstance(step, Move):
+            if not abs(took_s - step.seconds) <= WAIT_S:
+                self.wrong("a trial is as planned", f"waits {took_s:.2f} s, not {step.seconds:.2f}")
+            return
+        world = _world(rig)
+        true = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
+        wanted = world.plane.sensor(rig.plate_frame.pose(step.to))
+        if not math.dist(true[:3], wanted[:3]) <= PLACE_MM:
+            off = math.dist(true[:3], wanted[:3])
+            self.wrong("a trial is as planned", f"{step.phase} ends {off:.2f} mm off")
+        planned_s = at.distance_mm(step.to) / step.speed_mm_s
+        if not took_s >= 0.95 * planned_s - WAIT_S:
+            self.wrong("a trial is as planned", f"{step.phase} takes {took_s:.2f} s of {planned_s}")
+
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
         here = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
-        if world.arm_state is ArmState.PROTECTIVE_STOP:
-            self.wrong("no motion after a stop", f"it is sent on in {world.arm_state.value}")
         for segment in path:
             there = world.plane.sensor(segment.to)
             if self._asked_s is not None:
@@ -117,7 +194,8 @@ class Witness:
                     )
             if not 0 < segment.speed_mm_s <= self._speed_mm_s + 1e-6:
                 self.wrong("within limits", f"is sent at {segment.speed_mm_s} mm/s")
-            self._check_place(there, here, "is sent")
+            if self.lie.active not in {"pose_away", "pose_frozen"}:
+                self._check_place(there, here, "is sent")
 
     def _excess(self, place: Any) -> float:
         """Return how far a place on the true plate is beyond the limits, mm."""
@@ -128,18 +206,46 @@ class Witness:
         if not over <= max(self._excess(before), 0.0) + PLATE_MM:
             self.wrong("within limits", f"{how} {over:.2f} mm beyond them")
 
+    def _look_at_lie(self, now_s: float, moving: bool, place: Any, world: SimulatedWorld) -> None:
+        """A device that reports what cannot be stops the arm."""
+        kind, segment = self.lie.active, self._segment
+        if not (kind and moving and segment) or (kind == "pose_away" and self._misled):
+            self._lied_s = None
+            return
+        if self._lied_s is None:
+            self._lied_s = now_s
+        bound_s = self._poll_s + SLACK_S
+        if kind == "pose_frozen":
+            frozen = self.lie.frozen
+            if frozen is None or is_near(frozen, segment.to):
+                return
+            bound_s += STUCK_S + STUCK_MM / segment.speed_mm_s + self._poll_s
+        elif kind.startswith("force"):
+            there = world.plane.sensor(segment.to)
+            if math.dist(place[:2], there[:2]) < 0.5 and there[2] < place[2]:
+                return  # it leaves the plate, whatever the sensor says
+            bound_s = SILENT_S
+        if now_s - self._lied_s > bound_s:
+            self.wrong("no news and no number are a fault", f"moves on in spite of {kind}")
+
     def _look(self, world: SimulatedWorld) -> None:
         """Look at the arm where it truly is now."""
         now_s, moving = self._host.passed_s, world.path.moving(world.now_ns)
         place = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
+        self._look_at_lie(now_s, moving, place, world)
         if self._asked_s is not None and moving and self._starts == 0:
             late = now_s - self._asked_s
             if late > self._poll_s + 1e-3:
                 self.wrong("stops in time", f"still moves {late:.3f} s after it was asked to stop")
         over = self._excess(place)
-        if not (moving and over > PLATE_MM):
+        if not (moving and over > PLATE_MM) or self._misled:
             self._outside = None
         elif self._outside is None or over <= self._outside[1]:  # it may come back
             self._outside = now_s, over
         elif now_s - self._outside[0] > self._poll_s + SLACK_S:
             self.wrong("within limits", f"moves on {over:.2f} mm outside")
+
+
+def _world(rig: Rig) -> SimulatedWorld:
+    assert isinstance(rig.arm, MockArm)
+    return rig.arm._world

@@ -16,6 +16,7 @@ from sliplab.flows.cli.app import command_line
 from sliplab.flows.running import stopping
 from sliplab.flows.running.cluster import ClusterError
 from sliplab.rigs.core.capabilities import ArmFault
+from sliplab.rigs.core.guard import DepthError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Store
 from tests.analysis.labels.reviewable import Reviewable
@@ -250,3 +251,10 @@ def test_a_missing_file_of_a_store_is_named(tmp_path: Path) -> None:
     (store.folder / "store.json").write_text("{")
     error = error_of("trials", store.folder)
     assert (error["exit_code"], error["file"]) == (1, str(store.folder / "store.json"))
+
+
+def test_a_pose_beyond_a_limit_is_no_bug_of_the_program() -> None:
+    found = errors.failure(DepthError("depth in contact", 4.1, 3.6, "mm", "the arm was stopped"))
+    assert (found.trace, found.exit_code) == ("", 1)
+    assert "4.1 mm is beyond its limit 3.6 mm" in found.message
+    assert "RuntimeWarning" in errors.failure(RuntimeWarning("a bug")).trace

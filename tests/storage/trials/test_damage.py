@@ -50,6 +50,7 @@ DAMAGE = """
     write ../x | x: is not a campaign folder | damaged
     link . | is not a campaign folder | damaged
     write .campaign.json.NOBODY.tmp | was left by a killed program | unfinished
+    write trials/t/.cause.json.NOBODY.tmp | was left by a killed program | unfinished
     make quarantine/t.1 | gives no cause | damaged
     make trials/e | checksums.json: cannot | damaged
     write trials/e | e: is not a trial folder | damaged
@@ -94,6 +95,8 @@ def test_verify_names_it_and_what_is_whole_stays_readable(
     said = [f"{item.path}: {item.what}" for item in problems if item.kind == kinds[kind]]
     assert any(says in text for text in said), said or problems
     assert all(item.trial != "whole" for item in problems)
+    if kind == "unfinished":
+        assert all(item.kind == UNFINISHED for item in problems)
     json.dumps([vars(item) for item in problems])
     if whole.exists() and not where.folder.is_symlink():
         assert len(Recording(whole).events()) == 1000

@@ -1,0 +1,231 @@
+"""Runs that come due at a page whose answers get lost: its clients and processes, simulated."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from concurrent.futures import Executor, Future
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID
+from zoneinfo import ZoneInfo
+
+from prefect.client.schemas.responses import SetStateStatus
+from prefect.states import Cancelling, Completed, Running, Scheduled
+
+from sliplab.flows.running import run_records
+from sliplab.flows.server import runs, schedules
+from sliplab.flows.server.runs import ServedRuns
+from tests.storm.virtual import Notes
+
+POLL_S = 1.0
+STOP_LIMIT_S = 30.0
+"""Time that a run has to stop its arm and end."""
+CALM_S = 250
+"""Until when runs come due and answers get lost."""
+ZONES = ("UTC", "Europe/Rome", "America/New_York")
+
+
+class _Here(Executor):
+    """Carries out what is submitted at once."""
+
+    def submit(self, work: Any, /, *given: Any, **named: Any) -> Future[Any]:
+        """Return what is done already."""
+        done: Future[Any] = Future()
+        done.set_result(work(*given, **named))
+        return done
+
+
+@dataclass
+class _Process:
+    """A process of one run: it reports its state while it lives.
+
+    Attributes:
+        ends_s: when it ends by itself. silent: it is killed, and says nothing. deaf: to a signal.
+    """
+
+    run: Any
+    ends_s: float
+    silent: bool
+    deaf: bool
+    returncode: int | None = None
+    asked_s: float | None = None
+
+
+class Page:
+    """A server that keeps runs, and the clock of all that happens here.
+
+    Args:
+        lost: share of its answers that are lost, before or after they had effect.
+        store: where ends are recorded.
+    """
+
+    def __init__(self, rng: random.Random, notes: Notes, store: Path, lost: float) -> None:
+        self._rng, self._notes, self._store, self.lost = rng, notes, store, lost
+        self.now_s = 1000.0
+        self.runs: dict[UUID, Any] = {}
+        self.processes: list[_Process] = []
+
+    def due(self, deployment: UUID) -> None:
+        """Let a run come due."""
+        made = UUID(int=self._rng.getrandbits(128), version=4)
+        made_run = SimpleNamespace(id=made, deployment_id=deployment, name=f"run {len(self.runs)}")
+        made_run.state = Scheduled()
+        self.runs[made] = made_run
+
+    def _may_be_lost(self) -> None:
+        if self._rng.random() < self.lost:
+            raise TimeoutError("the page does not answer")
+
+    async def get_scheduled_flow_runs_for_deployments(
+        self, deployments: list[UUID], scheduled_before: datetime
+    ) -> list[Any]:
+        """Return the runs that are due."""
+        self._may_be_lost()
+        return [run for run in self.runs.values() if run.state.is_scheduled()]
+
+    async def read_flow_run(self, run: UUID) -> Any:
+        """Return a run as it is known."""
+        self._may_be_lost()
+        return SimpleNamespace(**vars(self.runs[run]))
+
+    async def set_flow_run_state(self, run: UUID, state: Any, force: bool = False) -> Any:
+        """Take a run's new state."""
+        self._may_be_lost()
+        self.runs[run].state = state
+        self._may_be_lost()
+        return SimpleNamespace(status=SetStateStatus.ACCEPT)
+
+    async def start(self, *command: str, **options: Any) -> Any:
+        """Start a process: `asyncio.create_subprocess_exec` here."""
+        run, rng = self.runs[UUID(command[4])], self._rng
+        if any(each.returncode is None for each in self.processes):
+            self.wrong("one run at a time is on the rig", run.name)
+        if any(each.run is run for each in self.processes):
+            self.wrong("a run is carried out once", run.name)
+        ends_s = self.now_s + rng.uniform(1, 40)
+        made = _Process(run, ends_s, silent=rng.random() < 0.2, deaf=rng.random() < 0.3)
+        self.processes.append(made)
+        run.state = Running()
+        run_records.begin(self._store, str(run.id), command[5], "http://page", "")
+        page = self
+
+        class Shown:
+            returncode = property(lambda shown: made.returncode)
+
+            def terminate(self) -> None:
+                made.asked_s = page.now_s if made.asked_s is None else made.asked_s
+                if not made.deaf:
+                    page.end(made, "CANCELLED", -15)
+
+            def kill(self) -> None:
+                if made.asked_s is None or page.now_s - made.asked_s < STOP_LIMIT_S - 1:
+                    page.wrong("a run has its time to stop the arm", run.name)
+                page.end(made, "", -9)
+
+        return Shown()
+
+    def end(self, process: _Process, state: str, code: int) -> None:
+        """End a process, which records how unless it was killed."""
+        if process.returncode is not None:
+            return
+        process.returncode = code
+        if state:
+            run_records.end(self._store, str(process.run.id), state, "it says so", "it")
+
+    def tick(self) -> None:
+        """Let a second pass."""
+        self.now_s += POLL_S
+        for process in self.processes:
+            if process.returncode is None and self.now_s > process.ends_s:
+                if process.deaf and process.asked_s is not None:
+                    continue  # it hangs in its stop
+                if process.silent:
+                    self.end(process, "", -9)
+                else:
+                    self.end(process, "COMPLETED", 0)
+                    if self._rng.random() < 0.7:  # else the page was lost to it, too
+                        process.run.state = Completed()
+
+    def cancel(self) -> None:
+        """A person cancels a run that is on the rig."""
+        for process in self.processes:
+            if process.returncode is None and process.run.state.is_running():
+                process.run.state = Cancelling()
+
+    def wrong(self, invariant: str, what: str) -> None:
+        """Note a fault."""
+        self._notes.add(wrong=invariant, what=what)
+
+
+async def _play(page: Page, served: ServedRuns, rig: UUID, words: UUID, rng: random.Random) -> None:
+    answered: list[str] = []
+    runs._carry_out_here = lambda flow, run: (  # type: ignore[assignment]
+        answered.append(run.name),
+        setattr(page.runs[run.id], "state", Completed()),
+    )
+    threads: Any = _Here()
+    for second in range(CALM_S + 60 * 40):
+        calm = second > CALM_S
+        if calm and all(run.state.is_final() for run in page.runs.values()):
+            break
+        page.lost = 0.0 if calm else page.lost
+        if not calm and rng.random() < 0.05:
+            page.due(rig if rng.random() < 0.7 else words)
+        if not calm and rng.random() < 0.02:
+            page.cancel()
+        page.tick()
+        with suppress(TimeoutError):
+            await served._look(page, threads)
+        await asyncio.sleep(0)
+        for process in page.processes:
+            late = process.asked_s is not None and page.now_s - process.asked_s > 2 * STOP_LIMIT_S
+            if calm and late and process.returncode is None:
+                page.wrong("a run that is cancelled ends", process.run.name)
+    for run in page.runs.values():
+        if not run.state.is_final():
+            page.wrong("every run comes to an end", f"{run.name} is {run.state.type.value}")
+            continue
+        known = run_records.end_of(page._store, str(run.id))
+        if known is not None and known["state"] != run.state.type.value:
+            what = f"{run.name} is {run.state.type.value}, it ended as {known['state']}"
+            page.wrong("the page says how a run ended", what)
+    if len({*answered}) != len(answered):
+        page.wrong("a run is carried out once", f"{answered}")
+
+
+def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
+    """Let runs come due, be cancelled and end, while the page is lost and comes back."""
+    rng = random.Random(seed)
+    _check_windows(rng, notes)
+    page = Page(rng, notes, store, lost)
+    runs.monotonic = lambda: page.now_s  # type: ignore[attr-defined]
+    runs.asyncio = SimpleNamespace(  # type: ignore[attr-defined]
+        **{**vars(asyncio), "create_subprocess_exec": page.start}
+    )
+    rig, words = (UUID(int=rng.getrandbits(128), version=4) for _ in range(2))
+    flow = SimpleNamespace(name="collect")
+    served = ServedRuns(store, {rig: flow}, {words: flow})
+    asyncio.run(_play(page, served, rig, words, rng))
+    notes.add(served=len(page.runs))
+
+
+def _check_windows(rng: random.Random, notes: Notes) -> None:
+    """Ends of windows, against a search minute by minute."""
+    for _ in range(5):
+        due = datetime.fromtimestamp(1_795_000_020 + 60 * rng.randrange(600_000), UTC)
+        zone, day = rng.choice(ZONES), rng.choice(["", "", rng.choice(schedules.DAYS)])
+        clock = f"{rng.choice([0, 3, 6, 22]):02d}:{rng.choice([0, 30]):02d}"
+        found = schedules.window_end(due, f"{day} {clock}".strip(), zone)
+        moment = due + timedelta(minutes=1)
+        while True:
+            wall = moment.astimezone(ZoneInfo(zone))
+            if f"{wall:%H:%M}" == clock and day in {"", schedules.DAYS[wall.weekday()]}:
+                break
+            moment += timedelta(minutes=1)
+        if found.timestamp() != moment.timestamp():
+            notes.add(wrong="a window ends as it says", what=f"{due} {day} {clock} {zone}: {found}")
