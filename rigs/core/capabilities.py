@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal, NotRequired, Protocol, TypedDict, runtime_checkable
+from typing import ClassVar, Literal, NotRequired, Protocol, TypedDict, runtime_checkable
 
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
@@ -41,6 +41,17 @@ class RigError(RuntimeError):
 
 class ArmFault(RigError):
     """The arm cannot move: protective or emergency stop, or no connection."""
+
+
+class StaysInContact(RigError):
+    """A failure after which the arm is stopped, and must not be moved clear."""
+
+    plate_held: ClassVar[bool] = False
+    """Whether fingers hold a plate that was released."""
+
+
+class PoseFault(ArmFault, StaysInContact):
+    """The arm's poses are not what it does: a way out that began at one could lead sideways."""
 
 
 class ArmState(Enum):

@@ -5,8 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from sliplab.rigs.core.capabilities import ArmFault, Pose, Segment
-from sliplab.rigs.core.guard import Guard, SpeedError
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    Pose,
+    PoseFault,
+    Segment,
+    StaysInContact,
+)
+from sliplab.rigs.core.guard import Guard, GuardError, SpeedError
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
@@ -21,6 +27,10 @@ SPEED_S, SPEED_SHARE, SPEED_MM, SPEED_DEG = 0.2, 0.2, 1.0, 1.0
 are noisy, and may be some packets old."""
 
 _NUMBERS = 6
+
+
+class MeasuredSpeedError(SpeedError, StaysInContact):
+    """Poses are further apart than the limit of speed allows: the arm or they cannot be trusted."""
 
 
 def check_pose(pose: Pose) -> Pose:
@@ -81,31 +91,37 @@ class MotionWatch:
             asked_ns: the rig's clock before the pose was read.
 
         Raises:
-            GuardError: pose or speed is beyond a limit.
-            ArmFault: the pose does not change although the arm should move.
+            GuardError: the pose is beyond a limit.
+            MeasuredSpeedError: the speed is.
+            PoseFault: the pose does not change although the arm should move.
         """
-        self._guard.check_measured(pose, self._begin, self._plate, self._closed_mm)
+        try:
+            self._guard.check_measured(pose, self._begin, self._plate, self._closed_mm)
+        except GuardError:
+            self._check_speed(pose)  # a place to which it cannot have come is not where it is
+            raise
         still_s = self._stall.waited_s(pose)
         if still_s > self._stuck_s and not is_near(pose, self._segment.to):
-            raise ArmFault(
+            raise PoseFault(
                 "arm",
-                f"has reported the same pose for {still_s:.1f} s while it should move; the arm "
-                "was stopped: check its connection, and whether it moves",
+                f"has reported the same pose for {still_s:.1f} s while it should move; it was "
+                "stopped, and stays where it is: check its connection, and whether it moves",
             )
-        self._check_speed(pose, asked_ns)
+        past_ns, past = self._past
+        # the time at which a pose was first seen counts
+        if pose != past and (self._now_ns() - past_ns) * 1e-9 >= SPEED_S:
+            self._check_speed(pose)
+            self._past = asked_ns, pose
 
-    def _check_speed(self, pose: Pose, asked_ns: int) -> None:
+    def _check_speed(self, pose: Pose) -> None:
         """Hold the mean speed since an earlier pose, of a turn on the spot too, to its limit."""
         limit, (past_ns, past) = self._guard.speed_mm_s, self._past
-        seconds = (self._now_ns() - past_ns) * 1e-9
-        if pose == past or seconds < SPEED_S:
-            return  # the time at which a pose was first seen counts
+        seconds = max(self._now_ns() - past_ns, 1) * 1e-9
         gone_mm = distance_mm(past, pose)
-        where = "the arm was stopped on its way, where its poses show"
+        where = "the arm was stopped on its way, and stays where it is"
         if not gone_mm <= (1.0 + SPEED_SHARE) * limit * seconds + SPEED_MM:
-            raise SpeedError("speed", gone_mm / seconds, limit, "mm/s", where)
+            raise MeasuredSpeedError("speed", gone_mm / seconds, limit, "mm/s", where)
         if self._segment.turn_deg_s is not None:
             turn_deg, most = angle_deg(past, pose), self._guard.turn_deg_s
             if not turn_deg <= (1.0 + SPEED_SHARE) * most * seconds + SPEED_DEG:
-                raise SpeedError("turn", turn_deg / seconds, most, "deg/s", where)
-        self._past = asked_ns, pose
+                raise MeasuredSpeedError("turn", turn_deg / seconds, most, "deg/s", where)

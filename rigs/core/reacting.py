@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from sliplab.protocols.program import ACTING, Move, Position, Program, Step
-from sliplab.rigs.core.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import ArmFault, RigError, StaysInContact
 from sliplab.rigs.core.force_watch import PressPlaces
-from sliplab.rigs.core.rig import Rig, StaysInContact, arm_fault, nuisances_of
+from sliplab.rigs.core.rig import Rig, arm_fault, nuisances_of
 from sliplab.storage.streams import Sink
 
 REST_S = 2.0
@@ -137,6 +137,8 @@ class SafeState(StaysInContact):
         cause: why slip could not be detected.
         reaction: the reaction carried out.
     """
+
+    plate_held = True
 
     def __init__(self, cause: str, kind: str, reaction: Reaction) -> None:
         took_ms = reaction.command_ms + reaction.actuator_ms

@@ -45,9 +45,11 @@ from sliplab.rigs.core.capabilities import (
     Operator,
     Plate,
     Pose,
+    PoseFault,
     RigError,
     Segment,
     Simulation,
+    StaysInContact,
     StoppingArm,
     SyncBox,
     Truth,
@@ -95,10 +97,6 @@ _STOP_RETRIES = 10
 
 class StopRequested(Exception):
     """A stop of the rig was requested; the arm has been stopped."""
-
-
-class StaysInContact(RigError):
-    """A failure after which the arm is stopped, and must not be moved clear."""
 
 
 @dataclass(frozen=True)
@@ -728,7 +726,9 @@ class Rig:
             if self.clock.now_ns() > deadline:
                 off = f"{distance_mm(here, segment.to):.1f} mm, {angle_deg(here, segment.to):.1f}"
                 text = f"reports the phase '{phase}' as finished, and its pose is {off} deg off"
-                raise ArmFault("arm", f"{text}: check the arm before the next move")
+                raise PoseFault(
+                    "arm", f"{text}; it stays where it is: check the arm before the next move"
+                )
             self.wait(force_watch.POLL_S, sink)
 
     def wait(self, seconds: float, sink: Sink | None = None) -> None:
@@ -985,7 +985,8 @@ class Rig:
                 if isinstance(error, RigError) and error.device == "arm":
                     fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
                 raise self._with_plate_warning(fault) from error
-            uncaught = self._plate_uncaught and not isinstance(error, StaysInContact)
+            held = isinstance(error, StaysInContact) and error.plate_held
+            uncaught = self._plate_uncaught and not held
             if uncaught and isinstance(error, RigError):
                 raise self._with_plate_warning(error) from error
             raise

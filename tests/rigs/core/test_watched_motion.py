@@ -15,9 +15,18 @@ import pytest
 from sliplab.protocols.program import Dwell, Move, Position, Program, Twist
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.arm_settings import ArmLimits
-from sliplab.rigs.core.capabilities import ArmFault, GripperState, Mounting, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    GripperState,
+    Mounting,
+    Pose,
+    PoseFault,
+    RigError,
+    Segment,
+)
 from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
+from sliplab.rigs.core.motion_watch import MeasuredSpeedError
 from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
@@ -469,6 +478,34 @@ def test_path_that_ends_elsewhere_than_reported_is_a_fault() -> None:
     with_arm(rig, lambda pose: stood)
     with pytest.raises(ArmFault, match=r"phase 'press' as finished, and its pose is 4\.4 mm"):
         rig.move(Move("press", DEEP, 4.0), HOME)
+
+
+def stands_still(now: Pose, held: Pose) -> Pose:
+    return held
+
+
+def jumps(now: Pose, held: Pose) -> Pose:
+    x, y, z = now.xyz_mm
+    return Pose((x + 20.0, y + 20.0, z), now.rotvec_deg)
+
+
+@pytest.mark.parametrize(("lie", "fault"), [(stands_still, PoseFault), (jumps, MeasuredSpeedError)])
+@pytest.mark.parametrize("seconds", [3.0, 8.0])
+def test_arm_whose_poses_are_wrong_is_stopped_and_not_moved(
+    lie: Callable[[Pose, Pose], Pose], fault: type[RigError], seconds: float
+) -> None:
+    """From a place where it is not, the way out would lead sideways over the skin."""
+    rig = home_rig()
+    rig.move(Move("press", DEEP, 10.0), HOME)
+    true, held = rig.arm.pose, rig.arm.pose()
+    since = rig.clock.now_ns() + 500_000_000
+    arm = with_arm(rig, lambda pose: lie(pose, held) if rig.clock.now_ns() > since else pose)
+    with pytest.raises(fault, match="stays where it is"), rig.safely(HOME):
+        rig.move(Move("slide", Position(seconds, 0.0, 2.4), 1.0), DEEP)
+    assert len(arm.started) == 1
+    at = rig.plate_frame.position(true().xyz_mm)
+    assert at.depth_mm == pytest.approx(2.4, abs=0.01)
+    assert arm.progress().done
 
 
 def drifting(rig: Rig, way: tuple[float, float, float], mm_s: float) -> None:
