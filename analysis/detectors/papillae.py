@@ -80,11 +80,12 @@ TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
 """An object that let go pulls the papillae's motion about for so long."""
 LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
-UNLOADED = 0.7
-"""Share of OFF events from which the skin is unloaded; markers that move have half."""
+UNLOADED = 0.9
+"""Share of OFF events from which the skin is unloaded. Markers that move have half, but at first
+one side of each is seen alone: up to 0.85 when ten places move."""
 TURNED = 4.0
 """Ratio of the odds of ON events where a marker turns back."""
-FEW_ON, OF_SEEN, OF_NOW = 0.05, 100.0, 20.0
+FEW_ON, OF_SEEN, OF_NOW = 0.05, 100.0, 5.0
 """Share of ON events before anything is seen, and of how many events; weight of those in memory."""
 MOST = 0.95
 """Of a share, so that a place's rate can change."""
