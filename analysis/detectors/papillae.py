@@ -408,7 +408,8 @@ def _advance_unloaded(
         memory += counts[k + MEMORY_MS - 1]
         memory_back += back[k + MEMORY_MS - 1]
         n, n_back = counts[k + MEMORY_MS + GAP_MS], back[k + MEMORY_MS + GAP_MS]
-        moving = memory >= FEWEST_EVENTS
+        # a place that is ON alone is the other side of a marker that begins to move
+        moving = (memory >= FEWEST_EVENTS) & (2 * memory_back < memory)
         others = moving & (pushed < SUSPECTED)
         if moving.sum() < fewest or not others.any():
             pushed[:] = 0.0
