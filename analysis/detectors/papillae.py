@@ -1,10 +1,13 @@
-"""Slip by what the papillae do: one of them falls silent while the others go on.
+"""Slip by what single papillae do while the others go on: fall silent, or turn back.
 
 While the skin is loaded, the markers of all papillae move in the image, and their edges cause
 events. A tip that slides is loaded no further, so its marker comes to rest: the first sign of slip
-is that one place causes no more events while the others cause as many as before. Nothing is
-trained, and nothing is known of the sensor but its size and what `sliplab calibrate detector` finds
-of its skin (`PapillaeSettings`).
+is that one place causes no more events while the others cause as many as before. While the skin is
+unloaded, as by a sensor that retracts from a plate that hangs on it, all markers merely shrink. A
+tip that slides then follows its normal force, so its marker moves back, and its place causes more
+events than the others. Nothing is trained, and nothing is known of the sensor but its size, that
+its markers are brighter than its skin, and what `sliplab calibrate detector` finds of its skin
+(`PapillaeSettings`).
 
 Every millisecond:
 
@@ -24,6 +27,11 @@ Every millisecond:
    slide. While an object brushes over single papillae, which shows by places with far more events
    than before, the statistic is divided by `TOUCHED_SCALE` too.
 
+While most events of the places are OFF, the skin is unloaded, and the test is another: a place
+causes twice the events that its number of cells lets expect, and its share of ON events is `TURNED`
+times the others' by odds. Both likelihoods are binomial. The statistic is divided by the dispersion
+alone, not by its square: what pushes all papillae causes ON events.
+
 Evidence is the sum of the two largest statistics of all places from `LEAST` on, since tips let go
 one after the other; 0 below, and while fewer than `fewest_places` of them move.
 """
@@ -40,7 +48,7 @@ from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
-VERSION = 1
+VERSION = 2
 """Incremented when the evidence of the same events is another."""
 BIN_US = 1000
 CELLS_ACROSS = 80
@@ -72,6 +80,13 @@ TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
 """An object that let go pulls the papillae's motion about for so long."""
 LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
+UNLOADED = 0.9
+"""Share of OFF events from which the skin is unloaded. Markers that move have half, but at first
+one side of each is seen alone: up to 0.85 when ten places move."""
+TURNED = 4.0
+"""Ratio of the odds of ON events where a marker turns back."""
+FEW_ON, OF_SEEN, OF_NOW = 0.05, 100.0, 5.0
+"""Share of ON events before anything is seen, and of how many events; weight of those in memory."""
 MOST = 0.95
 """Of a share, so that a place's rate can change."""
 PRIOR_DISPERSION = 4.0
@@ -117,8 +132,10 @@ class Papillae(Detector):
         self._shape = -(-height // self._cell_px), -(-width // self._cell_px)
         self._done = 0
         self._ms, self._cell = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._on = np.zeros(0, np.bool_)
         self._place = np.full(self._shape[0] * self._shape[1], -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
+        self._cells, self._unloaded = np.zeros(0), False
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
         self._age = np.zeros(2, np.int64)
 
@@ -127,6 +144,7 @@ class Papillae(Detector):
         row, column = events.y // self._cell_px, events.x // self._cell_px
         self._ms = np.concatenate([self._ms, events.t_us // BIN_US])
         self._cell = np.concatenate([self._cell, row.astype(np.int64) * self._shape[1] + column])
+        self._on = np.concatenate([self._on, events.p > 0])
         first, last = self._done, int(until_us) // BIN_US
         value = np.zeros(last - first)
         at = first
@@ -143,7 +161,7 @@ class Papillae(Detector):
             at = end
         self._done = last
         past = int(np.searchsorted(self._ms, last - SEEN_MS))
-        self._ms, self._cell = self._ms[past:], self._cell[past:]
+        self._ms, self._cell, self._on = self._ms[past:], self._cell[past:], self._on[past:]
         return Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
 
     def cost(self) -> Cost:
@@ -180,24 +198,31 @@ class Papillae(Detector):
 
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
-        seen = self._cell[self._between(at - SEEN_MS, at)]
+        part = self._between(at - SEEN_MS, at)
+        seen = self._cell[part]
         events = np.bincount(seen, minlength=len(self._place))
         if self.settings.hot:
             events[list(self.settings.hot)] = 0
         found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
-        self._place, self._rest, self._pushed, self._noise = found
+        self._place, self._rest, self._pushed, self._noise, self._cells = found
+        on = self._on[part][self._place[seen] >= 0]
+        self._unloaded = len(on) > 0 and 1 - on.mean() >= UNLOADED
 
     def _advance(self, first: int, value: F64) -> None:
         """Write the evidence of the milliseconds from `first` on."""
         oldest = first - MEMORY_MS - GAP_MS
         part = self._between(oldest, first + len(value))
-        counts = _counts(
-            self._ms[part], self._cell[part], oldest, len(value), self._place, self._noise
-        )
-        scale = self._dispersion() ** 2
-        fewest = self.settings.fewest_places
+        ms, cell, noise = self._ms[part], self._cell[part], self._noise
+        counts = _counts(ms, cell, oldest, len(value), self._place, noise)
+        scale, fewest = self._dispersion(), self.settings.fewest_places
         rest, pushed = self._rest, self._pushed
-        _advance(counts, self._noise, rest, pushed, self._age, scale, fewest, value)
+        if self._unloaded:
+            rest[:] = self._age[:] = 0
+            on = self._on[part]
+            back = _counts(ms[on], cell[on], oldest, len(value), self._place, noise)
+            _advance_unloaded(counts, back, noise, self._cells, pushed, scale, fewest, value)
+        else:
+            _advance(counts, noise, rest, pushed, self._age, scale**2, fewest, value)
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""
@@ -227,8 +252,8 @@ class Papillae(Detector):
 @njit(cache=True, nogil=True)
 def _places(
     events: I64, columns: int, before: I64, rest: F64, pushed: F64
-) -> tuple[I64, F64, F64, F64]:
-    """Return the place of each cell, -1 for none, and the places' statistics and noise.
+) -> tuple[I64, F64, F64, F64, F64]:
+    """Return the place of each cell, -1 for none, and the places' statistics, noise and cells.
 
     Args:
         events: of each cell, row by row. before: the cells' former places.
@@ -239,7 +264,7 @@ def _places(
     place = np.full(len(events), -1)
     stack, members = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
     new_rest, new_pushed = np.zeros(len(events)), np.zeros(len(events))
-    new_noise = np.zeros(len(events))
+    new_noise, cells = np.zeros(len(events)), np.zeros(len(events))
     places = 0
     for start in range(len(events)):
         if events[start] < least or place[start] != -1:
@@ -269,9 +294,9 @@ def _places(
                 new_pushed[places] += events[cell] * pushed[before[cell]]
         new_rest[places] /= total
         new_pushed[places] /= total
-        new_noise[places] = size * noise / SEEN_MS
+        new_noise[places], cells[places] = size * noise / SEEN_MS, size
         places += 1
-    return place, new_rest[:places], new_pushed[:places], new_noise[:places]
+    return place, new_rest[:places], new_pushed[:places], new_noise[:places], cells[:places]
 
 
 @njit(cache=True, nogil=True)
@@ -356,6 +381,68 @@ def _advance(
             most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if age[0] > 0 else 1.0))
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]
+
+
+@njit(cache=True, nogil=True)
+def _advance_unloaded(
+    counts: I64,
+    back: I64,
+    noise: F64,
+    cells: F64,
+    pushed: F64,
+    scale: float,
+    fewest: int,
+    value: F64,
+) -> None:
+    """Advance the statistics of places whose markers turn back, and write the evidence.
+
+    Args:
+        counts, back: events, and those that are ON, as of `_counts`.
+        noise: events a millisecond of each place. cells: of each place.
+        pushed: statistics, which are changed. scale: the dispersion.
+        fewest: places that must move. value: of each millisecond.
+    """
+    memory = counts[: MEMORY_MS - 1].sum(axis=0)
+    memory_back = back[: MEMORY_MS - 1].sum(axis=0)
+    for k in range(len(value)):
+        memory += counts[k + MEMORY_MS - 1]
+        memory_back += back[k + MEMORY_MS - 1]
+        n, n_back = counts[k + MEMORY_MS + GAP_MS], back[k + MEMORY_MS + GAP_MS]
+        # a place that is ON alone is the other side of a marker that begins to move
+        moving = (memory >= FEWEST_EVENTS) & (2 * memory_back < memory)
+        others = moving & (pushed < SUSPECTED)
+        if moving.sum() < fewest or not others.any():
+            pushed[:] = 0.0
+        else:
+            all_n, all_w = n[others].sum(), memory[others].sum()
+            weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
+            on = (memory_back[others].sum() + FEW_ON * OF_SEEN) / (all_w + OF_SEEN)
+            on = (n_back[others].sum() + on * OF_NOW) / (all_n + OF_NOW)
+            turned = TURNED * on / (1 + (TURNED - 1) * on)
+            rate, mean = all_w / MEMORY_MS, cells[others].mean()
+            shrinking = max(rate - noise[others].sum(), 0.0) / cells[others].sum()
+            for j in range(len(pushed)):
+                if not moving[j]:
+                    pushed[j] = 0.0
+                    continue
+                # markers that touch are one place; one that begins to move has few cells yet
+                expected = shrinking * max(cells[j], mean) + noise[j]
+                alone = 0 if others[j] else 1
+                share = min(expected / (rate + alone * expected), MOST / DISTURBED)
+                total = all_n + alone * n[j]
+                ratio = _log_ratio(DISTURBED * share, share, n[j], total)
+                ratio += _log_ratio(turned, on, n_back[j], n[j])
+                pushed[j] = max(pushed[j] + weight * ratio, 0.0)
+            most = np.sort(pushed)[-2:].sum() / scale
+            value[k] = most if most >= LEAST else 0.0
+        memory -= counts[k]
+        memory_back -= back[k]
+
+
+@njit(cache=True, nogil=True)
+def _log_ratio(share: float, other: float, n: float, total: float) -> float:
+    """Return the log of the ratio of two shares' likelihoods, by binomial counts."""
+    return n * math.log(share / other) + (total - n) * math.log((1 - share) / (1 - other))
 
 
 @njit(cache=True, nogil=True)

@@ -7,18 +7,12 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.detectors.alarms import SceneEvidence, promised_levels
 from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, Scene, Slip
-from sliplab.analysis.detectors.detector_comparison import (
-    TrialEvidence,
-    allowed_early,
-    set_levels,
-)
-from sliplab.analysis.detectors.detectors import WindowEvidence
+from sliplab.analysis.detectors.detector_comparison import allowed_early
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.onset_references import references_of, still_until_ns
@@ -32,8 +26,9 @@ from sliplab.storage.trials.store import Store, StoreError
 def fitted_to(store: Store, detector: Detector, promise: float | None = None) -> AtLevel:
     """Return a detector that the store's training trials trained, at the level of its validation.
 
-    The level is that of the detector comparison: the lowest at which at most the middle one of
-    `compare.rates` of the validation trials are false early, or that which promises a rate.
+    The level is the lowest at which at most the middle one of `compare.rates` of the validation
+    trials have an alarm while surely nothing slips (`still_until_ns`), or that which promises a
+    rate. An alarm between the physical slip and the label's onset is not false.
 
     Args:
         promise: false alarms an hour without slip, at most.
@@ -48,15 +43,19 @@ def fitted_to(store: Store, detector: Detector, promise: float | None = None) ->
     train = scenes(labels, campaigns, "train", asked.train_trials)
     validation = scenes(labels, campaigns, "validation")
     detector.train(train, validation)
+    judged = [judged_scene(it, feed(detector, it)) for it in validation]
     if promise is not None:
-        found = [judged_scene(it, feed(detector, it)) for it in validation]
-        (level,) = promised_levels(found, [promise])
+        (level,) = promised_levels(judged, [promise])
         return AtLevel(detector, level.value, level)
-    judged = [TrialEvidence(_windows(feed(detector, it)), _slip(it)) for it in validation]
-    tolerance = round(rule.false_early_ms * 1e6)
     rate = asked.rates[len(asked.rates) // 2]
-    levels = set_levels(judged, allowed_early(rate, len(judged)), tolerance)
-    return AtLevel(detector, levels.incipient)
+    highest = sorted((_highest_when_still(it) for it in judged), reverse=True)
+    return AtLevel(detector, highest[allowed_early(rate, len(judged))])
+
+
+def _highest_when_still(judged: SceneEvidence) -> float:
+    evidence = judged.evidence
+    still = evidence.t_us < judged.slip.physical_us
+    return float(evidence.value[still].max(initial=-np.inf))
 
 
 def scenes(
@@ -125,13 +124,3 @@ def scene(recording: Recording, name: str, slip: TrueSlip, still_ns: int | None 
         Slip(incipient_us, incipient_us, us(slip.gross_ns) - begin_us),
         still_us=None if still_ns is None else max(us(still_ns) - begin_us, 0),
     )
-
-
-def _windows(found: Evidence) -> WindowEvidence:
-    none: npt.NDArray[np.float64] = np.full(len(found), -np.inf)
-    return WindowEvidence(found.t_us * 1000, found.value, lambda first: none)
-
-
-def _slip(given: Scene) -> TrueSlip:
-    gross_us = given.slip.gross_us
-    return TrueSlip(given.slip.paper_us * 1000, gross_us * 1000, max(given.end_us, gross_us) * 1000)

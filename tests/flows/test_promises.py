@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,16 +12,18 @@ import pytest
 
 from sliplab.analysis.campaigns import collected, training_campaigns
 from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.detector import Detector, Evidence, Scene
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.live import LiveDetector
 from sliplab.analysis.detectors.registry import make_detector
-from sliplab.analysis.detectors.stored_scenes import each_scene
+from sliplab.analysis.detectors.stored_scenes import each_scene, fitted_to
 from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.flows.detecting.sources import named_source
 from sliplab.flows.evaluations import run_evaluation
 from sliplab.flows.store_detectors import detectors_of
 from sliplab.protocols import InputError
+from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.flows.calibrating.test_calibrate import run
@@ -85,6 +88,28 @@ def test_detect_has_the_same_levels(store: Store) -> None:
     assert made.set_by is not None
     assert not made.set_by.promised
     assert made.level == made.set_by.value
+
+
+class SeesTheSlip(Detector):
+    """Evidence 1 while surely nothing slips, and 9 from then on, ahead of the label's onset."""
+
+    def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
+        self.coming = list(validation)
+
+    def begin(self, width: int, height: int) -> None:
+        self.scene = self.coming.pop(0)
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        still_us = self.scene.still_us
+        assert still_us is not None
+        assert still_us < self.scene.slip.paper_us
+        t_us = np.arange(until_us - 999_999, until_us + 1, 1000)
+        t_us = t_us[t_us > (until_us - 1) // 1_000_000 * 1_000_000]
+        return Evidence.of(t_us, np.where(t_us < still_us, 1.0, 9.0))
+
+
+def test_an_alarm_before_the_label_is_false_only_while_surely_nothing_slips(store: Store) -> None:
+    assert fitted_to(store, SeesTheSlip()).level == 1.0
 
 
 def test_a_calibrated_detector_is_judged_on_stored_trials(store: Store, document: Path) -> None:

@@ -1,4 +1,4 @@
-"""Slip by the silence of single papillae, on drawn events whose rates are known."""
+"""Slip by what single papillae do, on drawn events whose rates and polarities are known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import binom, chi2
 
-from sliplab.analysis.detectors.papillae import REMAINING_MEAN, Papillae, _page
+from sliplab.analysis.detectors.papillae import REMAINING_MEAN, Papillae, _log_ratio, _page
 from sliplab.storage.streams import EventChunk
 
 WIDTH, HEIGHT = 640, 480
@@ -26,11 +26,17 @@ LEVEL = 12.0
 Rates = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
 
 
-def drawn(rng: np.random.Generator, rates: Rates, noise_hz: float = 3000.0) -> EventChunk:
+def drawn(
+    rng: np.random.Generator,
+    rates: Rates,
+    noise_hz: float = 3000.0,
+    on: Rates = lambda t: np.ones((len(t), len(CENTRES))),
+) -> EventChunk:
     """Draw Poisson events on the markers' edges, and noise all over the sensor.
 
     Args:
         rates: of times, s, (n,): those of the markers, Hz, (n, 19), at most four times `RATE_HZ`.
+        on: their shares of ON events, likewise; noise is half ON.
     """
     most = 4 * RATE_HZ
     parts = []
@@ -38,15 +44,17 @@ def drawn(rng: np.random.Generator, rates: Rates, noise_hz: float = 3000.0) -> E
         t = rng.uniform(0, END_S, rng.poisson(most * END_S))
         t = t[rng.uniform(0, most, len(t)) < rates(t)[:, marker]]
         angle = rng.uniform(0, 2 * np.pi, len(t))
-        parts.append((t, x + RADIUS_PX * np.cos(angle), y + RADIUS_PX * np.sin(angle)))
+        p = rng.uniform(0, 1, len(t)) < on(t)[:, marker]
+        parts.append((t, x + RADIUS_PX * np.cos(angle), y + RADIUS_PX * np.sin(angle), p))
     n = rng.poisson(noise_hz * END_S)
-    parts.append((rng.uniform(0, END_S, n), rng.uniform(0, WIDTH, n), rng.uniform(0, HEIGHT, n)))
-    t, x, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+    t, x, y = rng.uniform(0, END_S, n), rng.uniform(0, WIDTH, n), rng.uniform(0, HEIGHT, n)
+    parts.append((t, x, y, rng.uniform(0, 1, n) < 0.5))
+    t, x, y, p = (np.concatenate(each) for each in zip(*parts, strict=True))
     order = np.argsort(t)
     return EventChunk(
         x[order].astype(np.uint16),
         y[order].astype(np.uint16),
-        np.ones(len(t), np.uint8),
+        p[order].astype(np.uint8),
         (1e6 * t[order]).astype(np.int64),
     )
 
@@ -143,6 +151,64 @@ def test_what_moves_all_alike_and_what_pushes_single_ones_is_no_slip(
     assert evidence(drawn(np.random.default_rng(seed), rates)).max() < LEVEL
 
 
+def shrinking(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers shrink from 0.3 s on, at a fifth of the rate at which they move."""
+    return moving(t) / 5
+
+
+def dark(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Shares of ON events of markers that shrink."""
+    return np.full((len(t), len(CENTRES)), 0.02)
+
+
+def one_jumps(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The last marker moves, so that its edge causes five times the events."""
+    rates = shrinking(t)
+    rates[t > SLIP_S, -1] *= 5
+    return rates
+
+
+def one_turns(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Half of the last marker's edge becomes brighter."""
+    share = dark(t)
+    share[t > SLIP_S, -1] = 0.5
+    return share
+
+
+def faster(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers shrink four times as fast, as when the arm speeds up."""
+    return shrinking(t) * np.where(t > SLIP_S, 4.0, 1.0)[:, None]
+
+
+def all_turn(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """All markers swing for 60 ms, as after a knock."""
+    return np.where(((t > SLIP_S) & (t < SLIP_S + 0.06))[:, None], 0.5, dark(t))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    ("rates", "on", "within_ms"), [(one_jumps, dark, 30), (shrinking, one_turns, 120)]
+)
+def test_a_marker_that_turns_back_while_the_skin_is_unloaded_is_seen(
+    seed: int, rates: Rates, on: Rates, within_ms: int
+) -> None:
+    value = evidence(drawn(np.random.default_rng(seed), rates, on=on))
+    slip_ms = round(1000 * SLIP_S)
+    assert value[:slip_ms].max() < LEVEL
+    assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
+
+
+@pytest.mark.parametrize(
+    ("rates", "on"), [(shrinking, dark), (faster, dark), (shrinking, all_turn), (faster, all_turn)]
+)
+@pytest.mark.parametrize("noise_hz", [3000.0, 60000.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_unloads_all_alike_is_no_slip(
+    rates: Rates, on: Rates, noise_hz: float, seed: int
+) -> None:
+    assert evidence(drawn(np.random.default_rng(seed), rates, noise_hz, on)).max() < LEVEL
+
+
 def test_hot_pixels_that_go_out_are_no_slip() -> None:
     rng = np.random.default_rng(3)
     events = drawn(rng, moving)
@@ -160,8 +226,11 @@ def test_hot_pixels_that_go_out_are_no_slip() -> None:
 
 
 @pytest.mark.parametrize("chunk_us", [1000, 7300, 10_000, 333_333])
-def test_evidence_is_the_same_to_the_bit_in_any_chunks(chunk_us: int) -> None:
-    events = drawn(np.random.default_rng(1), one_stops)
+@pytest.mark.parametrize(("rates", "share"), [(one_stops, 1.0), (one_jumps, 0.02)])
+def test_evidence_is_the_same_to_the_bit_in_any_chunks(
+    chunk_us: int, rates: Rates, share: float
+) -> None:
+    events = drawn(np.random.default_rng(1), rates, on=lambda t: np.full((len(t), 19), share))
     whole = evidence(events)
     assert whole.max() > LEVEL
     assert np.array_equal(evidence(events, chunk_us), whole)
@@ -183,6 +252,7 @@ def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
         expected = binom.logpmf(n, total, ratio * share) - binom.logpmf(n, total, share)
         after = _page(50.0, ratio, n, total, share)  # so far from 0 that nothing is cut off
         assert after - 50.0 == pytest.approx(expected, rel=1e-12)
+        assert _log_ratio(ratio * share, share, n, total) == pytest.approx(expected, rel=1e-12)
     assert _page(0.0, ratio, 9.0, total, share) == 0.0
 
 

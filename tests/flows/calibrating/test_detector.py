@@ -149,7 +149,7 @@ def test_a_skin_that_was_not_seen_writes_nothing(
     ("change", "says"),
     [
         ({"detector": "rate"}, "detector = rate: must be papillae"),
-        ({"version": 99}, "version = 99: must be 1"),
+        ({"version": 99}, "version = 99: must be 2"),
         ({"level": "high"}, "level"),
         ({"format": 2}, "newer version"),
         ({"level": 1e9}, "level = .*: must be 12, of hold and unload"),
