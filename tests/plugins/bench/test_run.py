@@ -226,9 +226,7 @@ def test_a_detector_has_nothing_but_what_it_was_given(tmp_path: Path) -> None:
     assert row.decision_us > 0
 
 
-def test_a_seed_is_drawn_once_for_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_seed_is_drawn_once_for_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     drawn = iter((1, 2))  # whose scenes have been simulated
     monkeypatch.setattr(run.secrets, "randbelow", lambda _: next(drawn))
