@@ -56,11 +56,13 @@ class Export:
 
     Attributes:
         of: what it is of. options: names of the options that it takes.
+        possible: False for one that is refused, with its reason.
     """
 
     of: Literal["store", "trials", "model"]
     write: Callable[[ExportRequest], ExportResult]
     options: frozenset[str] = frozenset()
+    possible: bool = True
 
 
 TITLES = {
@@ -82,7 +84,9 @@ def fitting_forms(place: str) -> str:
     by_kind: dict[str, list[str]] = {}
     for name in export_names():
         with suppress(PluginError):  # of a plug-in that cannot be used
-            by_kind.setdefault(known_export(name).of, []).append(name)
+            form = known_export(name)
+            if form.possible:
+                by_kind.setdefault(form.of, []).append(name)
     models, stores, trials = (
         ", ".join(by_kind.get(kind, [])) for kind in ("model", "store", "trials")
     )

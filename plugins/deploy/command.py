@@ -89,7 +89,7 @@ def refuse_nir(_request: ExportRequest) -> ExportResult:
 
 CARD = Export("model", write, frozenset({"store", "campaign"}))
 ONNX = Export("model", write, CARD.options | {"windows"})
-NIR = Export("model", refuse_nir)
+NIR = Export("model", refuse_nir, possible=False)
 
 
 def _model_pairs(result: ExportedModel) -> dict[str, object]:

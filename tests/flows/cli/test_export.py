@@ -27,6 +27,7 @@ def test_every_form_is_known() -> None:
         "mcap",
         "lerobot",
         "onnx",
+        "nir",
         "card",
     }
     assert {known_export(name).of for name in export_names()} == {"trials", "store", "model"}
