@@ -120,7 +120,7 @@ def windows(first: datetime, minutes: int, open_min: int, closed_min: int) -> li
 def write_files(folder: Path, plan: list[Window], port: int) -> Path:
     """Write protocols, rig and schedules; return the schedules' file."""
     pilot = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
-    for name, repetitions in (("long", 300), ("short", 1)):
+    for name, repetitions in (("long", 900), ("short", 1)):
         pilot |= {"name": name}
         pilot["collection"]["repetitions"] = repetitions
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(pilot))
