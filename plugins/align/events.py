@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import re
 import unicodedata
 from dataclasses import dataclass, replace
@@ -16,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from sliplab.protocols.adapter_parts import TIME_UNITS
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.tables import MOST_TABLE, TableRow, exact_ns, rows_of_csv
+from sliplab.storage.formats.tables import (
+    MOST_TABLE,
+    TableRow,
+    exact_ns,
+    rows_of_csv,
+    table_text,
+)
 
 Ints = NDArray[np.int64]
 
@@ -152,22 +157,9 @@ def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
 def _text(path: Path) -> str:
     try:
         with path.open("rb") as file:
-            data = file.read(MOST_TABLE + 1)
+            return table_text(str(path), file.read(MOST_TABLE + 1))
     except OSError as error:
         raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
-    if len(data) > MOST_TABLE:
-        text = f"is larger than {MOST_TABLE >> 20} MiB: give only the events that both clocks saw"
-        raise InputError(path, "", None, text)
-    if data.startswith((b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
-        raise InputError(path, "", None, "is a workbook or compressed: save it as CSV, unpacked")
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    try:
-        text = data.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"byte {error.start}", None, "is not UTF-8 text") from None
-    if "\0" in text:
-        raise InputError(path, f"byte {text.index(chr(0))}", None, "is no text")
-    return text
 
 
 def _time_column(name: str, columns: list[str]) -> tuple[str, str | None]:

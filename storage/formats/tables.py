@@ -7,6 +7,7 @@ numpy's arrays, read column by column.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
@@ -90,13 +91,7 @@ def read_rows(folder: DataFolder, name: str) -> list[TableRow]:
         InputError: it is damaged, has no heading, a column twice, or is larger than 64 MiB.
     """
     place = folder.place(name)
-    data = bytes(folder.read(name)[: MOST_TABLE + 1])
-    if len(data) > MOST_TABLE:
-        raise InputError(place, "", None, f"is larger than {MOST_TABLE >> 20} MiB")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(place, f"byte {error.start}", None, "is not UTF-8 text") from None
+    text = table_text(place, bytes(folder.read(name)[: MOST_TABLE + 1]))
     ending = name.lower().rpartition(".")[2]
     if ending == "json":
         return _from_json(place, _json(place, text, None), "list")
@@ -108,6 +103,30 @@ def read_rows(folder: DataFolder, name: str) -> list[TableRow]:
             for row in _from_json(place, [_json(place, line, number)], "lines", number)
         ]
     return rows_of_csv(place, text)[1]
+
+
+def table_text(place: str, data: bytes) -> str:
+    """Return the text of a table, UTF-8 or UTF-16 with its byte order mark.
+
+    Args:
+        place: for messages. data: of a larger file the first `MOST_TABLE` bytes and one more.
+
+    Raises:
+        InputError: it is larger, compressed, a workbook, or no text.
+    """
+    if len(data) > MOST_TABLE:
+        text = f"is larger than {MOST_TABLE >> 20} MiB: leave out rows and columns without use"
+        raise InputError(place, "", None, text)
+    if data.startswith((b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
+        raise InputError(place, "", None, "is a workbook or compressed: save it as CSV, unpacked")
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(place, f"byte {error.start}", None, "is not UTF-8 text") from None
+    if "\0" in text:
+        raise InputError(place, f"byte {text.index(chr(0))}", None, "is no text")
+    return text
 
 
 def _json(place: str, text: str, line: int | None) -> Any:

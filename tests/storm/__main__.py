@@ -218,7 +218,7 @@ def _start(asked: argparse.Namespace, **other: Any) -> subprocess.Popen[str]:
 
 
 def _jobs(asked: argparse.Namespace) -> dict[str, Any]:
-    """Play in several processes, each with every so manieth seed."""
+    """Play in several processes, each with every n-th seed."""
     began = time.monotonic()
     shares = {
         name: None if (whole := getattr(asked, name)) is None else whole / asked.jobs

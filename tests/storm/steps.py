@@ -337,7 +337,7 @@ def bring(process: Process, step: dict[str, Any]) -> None:
 
 
 def _remote(process: Process, step: dict[str, Any]) -> Remote:
-    """Return the URL of the copy, which fails at every so manieth object, or reads it in part."""
+    """Return the URL of the copy, which fails at every n-th object, or reads part of it."""
     fails, short = step["fails"], step.get("short", False)
     folder = process.stage.data / "remote"
     remote, seen = Remote(f"file://{folder}"), [0]

@@ -140,11 +140,11 @@ class Witness:
                 return may
             self._notes.add(begins=trial.id)
             if (pause := control.paused(store)) is not None:
-                self.wrong("requests are carried out", f"goes on in spite of a {pause.kind}")
+                self.wrong("requests are carried out", f"continues in spite of a {pause.kind}")
             if trial.id in control.skipped(campaign):
                 self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
             if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
-                self.wrong("requests are carried out", "goes on in spite of a stop")
+                self.wrong("requests are carried out", "continues in spite of a stop")
             if until is not None and self._host.wall_s > until:
                 self.wrong("no trial begins outside its window", trial.id)
             folders = campaign.folders("trials")

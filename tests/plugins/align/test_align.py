@@ -217,7 +217,7 @@ FILES: dict[str, tuple[str | bytes, str]] = {
     "Latin-1": ("Zeit µs\n1".encode("latin-1"), "byte 5: is not UTF-8 text"),
     "gzip": (gzip.compress(PLAIN.encode()), "is a workbook or compressed: save it as CSV"),
     "Excel": (b"PK\3\4", "is a workbook or compressed: save it as CSV"),
-    "huge": (b"1\n" * 600, "is larger than 0 MiB: give only the events"),
+    "huge": (b"1\n" * 600, "is larger than 0 MiB: leave out rows"),
     "unknown": (_table("frame,stamp", "{k},{:.9f}"), "heading = frame, stamp: name the column"),
     "long rows": (_table("1", "{k},{:.9f}"), "row 2: has 2 cells below a heading of 1 column"),
     "decimal comma": (PLAIN.replace(".", ","), "1 column; a number has a decimal point"),
@@ -243,7 +243,7 @@ def test_files_of_strangers_are_read_or_their_fault_is_named(
 ) -> None:
     data, text = FILES[name]
     if name == "huge":
-        monkeypatch.setattr("sliplab.plugins.align.events.MOST_TABLE", 1000)
+        monkeypatch.setattr("sliplab.storage.formats.tables.MOST_TABLE", 1000)
     a, b = tmp_path / "a.csv", tmp_path / "b.csv"
     a.write_bytes(data if isinstance(data, bytes) else data.encode())
     _write(b, "t", A - 12.5)
