@@ -102,7 +102,7 @@ def tick_of(reference: Ints) -> float:
         raise NoMatchError(
             "no_match",
             f"pulses of the reference come {tick:.0f} ns apart; at least 1000 ns are needed: check "
-            "that these are the sync box's pulses, in ns",
+            "the unit of their times",
         )
     return tick
 

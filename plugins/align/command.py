@@ -34,9 +34,11 @@ def align_(
         ),
     ] = None,
     within: Annotated[
-        float,
-        typer.Option("--within", min=0, max=1e9, help="By how much --offset may be wrong, s."),
-    ] = 0.1,
+        float | None,
+        typer.Option(
+            "--within", min=0, max=1e9, help="By how much --offset may be wrong, s; default: 0.1."
+        ),
+    ] = None,
     drift: Annotated[
         float,
         typer.Option(
@@ -45,7 +47,9 @@ def align_(
     ] = 500.0,
     unit: Annotated[
         str | None,
-        typer.Option("--unit", help="s, ms, us or ns; default: the column's name (time_ms), or s."),
+        typer.Option(
+            "--unit", help="Of all files: s, ms, us or ns; default: the column's (time_ms), or s."
+        ),
     ] = None,
     harp: Annotated[
         bool,
@@ -66,7 +70,12 @@ def align_(
     """
     from sliplab.plugins.align.align import AlignmentRefused, align
     from sliplab.plugins.align.events import events_from
+    from sliplab.protocols.adapter_parts import TIME_UNITS
 
+    if unit is not None and unit not in TIME_UNITS:
+        raise InputError("--unit", "", unit, "must be one of s, ms, us, ns")
+    if within is not None and offset is None:
+        raise InputError("--within", "", within, "needs --offset, which it bounds")
     if times is not None and out is None:
         raise InputError("--map", "", str(times), "needs --out, the file to write")
     if out is not None and not out.parent.is_dir():
@@ -81,7 +90,7 @@ def align_(
             first,
             second,
             offset_s=offset,
-            within_s=within,
+            **({} if within is None else {"within_s": within}),
             max_drift_ppm=drift,
         )
     except AlignmentRefused as refusal:

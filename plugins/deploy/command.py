@@ -75,8 +75,11 @@ def write(request: ExportRequest) -> ExportResult:
     return ExportResult(f"exported to {out}{simulated}", result, _model_pairs(result))
 
 
-def refuse_nir(_request: ExportRequest) -> ExportResult:
+def refuse_nir(request: ExportRequest) -> ExportResult:
     """NIR (Pedersen et al., 2024) has no neuron like these. Raises InputError: always."""
+    from sliplab.flows.detecting.request import load_model
+
+    load_model(Path(request.place))
     raise InputError(
         "--as",
         "",

@@ -296,6 +296,8 @@ def test_refusals_name_the_likely_cause(tmp_path: Path, name: str) -> None:
         (["--map", "b.csv"], "--map = b.csv: needs --out"),
         (["--out", "none/c.csv"], "--out = none/c.csv: its folder does not exist"),
         (["--unit", "h"], "unit = h: must be one of s, ms, us, ns"),
+        (["--unit", "kg"], "--unit = kg: must be one of s, ms"),
+        (["--within", "0.2"], "--within = 0.2: needs --offset"),
     ],
 )
 def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) -> None:

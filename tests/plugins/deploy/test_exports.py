@@ -88,15 +88,21 @@ def test_a_graph_of_other_classes_and_taxels(classes: int) -> None:
     assert onnx_counts(data, x[:0]).shape == (0, classes)
 
 
-def test_nir_is_refused_since_its_neurons_count_otherwise(tmp_path: Path) -> None:
+def test_nir_is_refused_since_its_neurons_count_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     x = sparse(50, FULL, 1, 0.1)
     net = biased(build(NetworkSettings(), FULL, 1), 1)
     ours = spike_counts(net, x)
     for name in SPIKING:
         getattr(net, name).reset_fn = MembraneSubtract()
     assert (spike_counts(net, x) != ours).any(axis=1).mean() > 0.9
+    request = ExportRequest(str(tmp_path / "seed0.pt"), "", "nir", tmp_path)
+    with pytest.raises(InputError, match=r"seed0\.pt"):
+        export(request)
+    monkeypatch.setattr("sliplab.flows.detecting.request.load_model", lambda _: fitted())
     with pytest.raises(InputError, match=r"nir: cannot hold .* --as onnx"):
-        export(ExportRequest("seed0.pt", "", "nir", tmp_path))
+        export(request)
 
 
 def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:
