@@ -127,9 +127,13 @@ def detectors_of(
         promise: false alarms an hour, at most, at which these set levels.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or nothing at `place`.
         StoreError: a network of the store is missing or stale.
     """
+    if place is not None and not place.exists():
+        raise InputError(
+            place, "", None, "is not there; expected a store's folder or a model's file"
+        )
     store = place if place is not None and place.is_dir() else None
     found: dict[str, Chosen] = {}
     if place is not None:
@@ -138,7 +142,9 @@ def detectors_of(
         if name in found:
             continue
         if not is_known(name):
-            raise InputError("--detector", "", name, one_of(name, [*found, *known()]))
+            raise InputError(
+                "--detector", "", name, one_of(name, list(dict.fromkeys([*found, *known()])))
+            )
         found[name] = Chosen(None, named_source(name, level, store, promise))
     return {name: found[name] for name in names or found}
 

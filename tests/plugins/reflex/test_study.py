@@ -119,6 +119,8 @@ def test_a_store_has_all_its_detectors(
     assert made[1].detected_ms is not None
     with pytest.raises(InputError, match="must be one of network, paper, smoothing, "):
         flow.request(place, RIG, tmp_path, fast, detectors=["smooth"])
+    with pytest.raises(InputError, match="elsewhere: is not there"):
+        flow.request(place / "elsewhere", RIG, tmp_path, fast, detectors=["papillae"])
     keys = {it.key for it in asked.cases}
     assert len(keys) == len(asked.cases)
 
