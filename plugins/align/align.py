@@ -40,6 +40,8 @@ Bools = NDArray[np.bool_]
 MAX_DRIFT_PPM = 500.0
 """Largest difference of two clocks' rates that is searched, by default."""
 MOST_DRIFT_PPM = 50_000.0
+WITHIN_S = 0.1
+"""By how much an approximate offset may be wrong, where nothing else is stated."""
 _MOST_OUTSIDE = 0.4
 """Largest share of a stretch's pairs that may lie off its line."""
 _BETWEEN = 8
@@ -229,7 +231,7 @@ def align(
     b: Any,
     *,
     offset_s: float | None = None,
-    within_s: float = 0.1,
+    within_s: float = WITHIN_S,
     max_drift_ppm: float = MAX_DRIFT_PPM,
     unit: str | None = None,
     harp: bool = False,

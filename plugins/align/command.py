@@ -68,7 +68,7 @@ def align_(
     Events are paired by ids (column id), by --offset, or by their pattern: random intervals or a
     code. Missing and spurious events, drift and jumps are found.
     """
-    from sliplab.plugins.align.align import AlignmentRefused, align
+    from sliplab.plugins.align.align import WITHIN_S, AlignmentRefused, align
     from sliplab.plugins.align.events import events_from
     from sliplab.protocols.adapter_parts import TIME_UNITS
 
@@ -90,7 +90,7 @@ def align_(
             first,
             second,
             offset_s=offset,
-            **({} if within is None else {"within_s": within}),
+            within_s=WITHIN_S if within is None else within,
             max_drift_ppm=drift,
         )
     except AlignmentRefused as refusal:
