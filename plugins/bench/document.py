@@ -90,6 +90,20 @@ class KeptDetector(Document):
     hours: dict[str, Number]
 
 
+class LimitPoint(Part):
+    """How soon an observer that knows the scene is certain, at so many false alarms an hour."""
+
+    asked: Number
+    latency_ms: MedianLatency
+
+
+class BenchLimit(Document):
+    """The limit of the bench's test slides, see `plugins.bench.limit`."""
+
+    slides: Int
+    points: tuple[LimitPoint, ...]
+
+
 class BenchResult(Document):
     """The whole table.
 
@@ -97,6 +111,7 @@ class BenchResult(Document):
         version: of the bench's scenes. size: which set of them. seed: of the test worlds.
         scenes: their number by part. hours: without slip, of validation and test scenes.
         detectors: the best first.
+        limit: what an observer that knows the scene would need; None in older results.
     """
 
     simulated: Bool
@@ -106,6 +121,7 @@ class BenchResult(Document):
     scenes: dict[str, Int]
     hours: dict[str, Number]
     detectors: tuple[BenchDetector, ...]
+    limit: BenchLimit | None = None
 
     @property
     def command(self) -> str:

@@ -65,12 +65,16 @@ def scores(scenes: Sequence[SceneEvidence], level: float) -> BenchScores:
 def _median(
     outcomes: Sequence[SceneAlarms], onsets_us: Sequence[int], worlds: Sequence[str]
 ) -> MedianLatency:
-    late = np.array(
-        [
-            np.inf if it.detected_us is None else (it.detected_us - onset_us) / 1e3
-            for it, onset_us in zip(outcomes, onsets_us, strict=True)
-        ]
-    )
+    late = [
+        np.inf if it.detected_us is None else (it.detected_us - onset_us) / 1e3
+        for it, onset_us in zip(outcomes, onsets_us, strict=True)
+    ]
+    return median_latency(late, worlds)
+
+
+def median_latency(late_ms: Sequence[float], worlds: Sequence[str]) -> MedianLatency:
+    """Return the median of latencies, infinite where missed, with its interval over worlds."""
+    late = np.array(late_ms)
     low, high = median_interval(late, worlds) or (None, None)
     value = float(np.median(late)) if len(late) else None
     return MedianLatency(value=_finite(value), low=_finite(low), high=_finite(high))

@@ -14,7 +14,7 @@ from sliplab.analysis.report.figures.style import (
 from sliplab.plugins.bench.document import BenchResult
 
 MARKERS = "osD^vPX*"
-TICKS_MS = (10, 20, 30, 50, 70, 100, 150, 200, 300, 400, 500, 700, 1000, 2000, 3000, 5000)
+TICKS_MS = (3, 5, 7, 10, 20, 30, 50, 70, 100, 150, 200, 300, 400, 500, 700, 1000, 2000, 3000, 5000)
 _LEAST = 0.5
 """Alarms that a scene without any is drawn at."""
 
@@ -23,7 +23,7 @@ def latency_against_alarms(found: BenchResult) -> str:
     """Return a curve for each detector that detects half of the slips, as SVG.
 
     Each point is a level that validation scenes set to an asked rate; the rate that test scenes
-    showed is drawn. The first point, filled, is the table's.
+    showed is drawn. The first point, filled, is the table's. A dotted line is the limit.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(WIDTH, 3.9))
@@ -51,6 +51,13 @@ def latency_against_alarms(found: BenchResult) -> str:
                 mfc=colour if filled else "white",
                 label=row.name,
             )
+            drawn += 1
+        limit = () if found.limit is None else found.limit.points
+        known = [
+            (point.asked, late) for point in limit if (late := point.latency_ms.value) is not None
+        ]
+        if known:
+            axes.plot(*zip(*known, strict=True), "k:", lw=1.2, label="scene known")
             drawn += 1
         axes.set_xscale("log")
         axes.set_yscale("log")

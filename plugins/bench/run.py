@@ -34,17 +34,25 @@ from sliplab.plugins.bench import scenes
 from sliplab.plugins.bench.apart import ApartDetector
 from sliplab.plugins.bench.audit import audit, drawn_edges
 from sliplab.plugins.bench.definition import SIZES, VERSION, Size
-from sliplab.plugins.bench.document import BenchDetector, BenchResult, KeptDetector
+from sliplab.plugins.bench.document import (
+    BenchDetector,
+    BenchLimit,
+    BenchResult,
+    KeptDetector,
+    LimitPoint,
+)
 from sliplab.plugins.bench.figures import (
     RATES,
     accuracy,
     disturbed_rate,
+    median_latency,
     nuisance_scores,
     ranked,
     tested,
 )
+from sliplab.plugins.bench.limit import waits_ms
 from sliplab.plugins.bench.nuisances import NUISANCES
-from sliplab.plugins.bench.scenes import SceneDraw
+from sliplab.plugins.bench.scenes import LONG_US, SceneDraw
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.files import make_folder, read_json, write_text
@@ -54,10 +62,9 @@ from sliplab.storage.trials.derived import Derived, make_key
 
 ENTRIES_VERSION = 3
 """Incremented when a shipped detector has other figures or intervals on the same scenes."""
+LIMIT_VERSION = 1
 AUDITED = 24
 """Slides of the test in which causality is checked."""
-LONG_US = 60_000_000
-"""Scenes with a long hold are left out there: they would take most of the time."""
 SEED_FILE = "seed.json"
 Advance = Callable[[], None]
 
@@ -295,6 +302,24 @@ def _judge_each(
             raise
 
 
+def find_limit(size: Size, seed: int) -> BenchLimit:
+    """Return what an observer that knows the scenes would need, over the test slides."""
+    drawn = [it for it in scenes.test_scenes(size, seed) if it.hold_s * 1e6 < LONG_US]
+    waits = []
+    with console.bar("limit (slides, simulated)", len(drawn)) as bar:
+        for slide in drawn:
+            waits.append(waits_ms(slide, RATES))
+            bar.advance()
+    worlds = [slide.world for slide in drawn]
+    return BenchLimit(
+        slides=len(drawn),
+        points=tuple(
+            LimitPoint(asked=asked, latency_ms=median_latency(late, worlds))
+            for asked, late in zip(RATES, zip(*waits, strict=True), strict=True)
+        ),
+    )
+
+
 def _drawn_seed(folder: Path) -> int:
     """Return the seed of a folder's test worlds, which is drawn once.
 
@@ -348,6 +373,10 @@ def run_bench(
     missing = [name for name, key in keys.items() if not saved.fresh(key[:16], key)]
     if missing:
         _judge_each([DetectorJob(name, SIZES[size], seed) for name in missing], workers, keep)
+    limit = Derived(folder / "limits")
+    of_size = make_key("limit of the bench", VERSION, [size, seed], [LIMIT_VERSION])
+    if not limit.fresh(of_size[:16], of_size):
+        limit.write(of_size[:16], of_size, find_limit(SIZES[size], seed))
     found = [saved.load(key[:16], KeptDetector) for key in keys.values()]
     return BenchResult(
         simulated=True,
@@ -357,4 +386,5 @@ def run_bench(
         scenes=BenchScenes(SIZES[size], seed).counts,
         hours=found[0].hours,
         detectors=tuple(ranked([one.row for one in found])),
+        limit=limit.load(of_size[:16], BenchLimit),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,13 @@ from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
-from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.capabilities import Truth
 from sliplab.rigs.core.faults import AnyFault
+from sliplab.rigs.core.rig import TrialRun
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.rig import simulated_rig
 from sliplab.rigs.mock.settings import scene_of
+from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import EventChunk
@@ -28,6 +32,8 @@ FRAMES_PX = 32
 SYNC_HZ = 100
 POLL_S = 2.0
 """Nothing waits for the streams; all that is read at once is in memory several times."""
+LONG_US = 60_000_000
+"""Scenes with a longer hold are left out where they would take most of the time."""
 AFTER_GROSS_US = 1_500_000
 """A scene ends so long after gross slip: later alarms say nothing, and training needs no more."""
 
@@ -134,23 +140,54 @@ def _value(span: Span, rng: np.random.Generator) -> float:
     return round(float(rng.uniform(span.low, span.high)), 2)
 
 
+@dataclass(frozen=True)
+class Taken:
+    """A simulated trial: its devices, what they sent, and the truth."""
+
+    devices: MockDevices
+    sink: Memory
+    done: TrialRun
+
+    @property
+    def truth(self) -> Truth:
+        """When tips slid and markers moved."""
+        assert self.done.truth is not None, "a simulated rig has a truth"
+        return self.done.truth
+
+
+def take(drawn: SceneDraw, watch: Callable[[SimulatedWorld], None] | None = None) -> Taken:
+    """Simulate the trial of a scene.
+
+    Args:
+        watch: is given the world before the trial.
+
+    Raises:
+        RigError: nothing slips in it.
+    """
+    file = changed(drawn.rig, {"faults": drawn.faults})
+    devices = build_mock(scene_of(file), file.timing, file.streams)
+    rig = simulated_rig(file, devices)
+    rig.poll_s = POLL_S
+    sink, plan = Memory(), _plan(drawn)
+    try:
+        rig.connect()
+        rig.frames.set_region(FRAMES_PX, FRAMES_PX)
+        if watch is not None:
+            watch(devices.world)
+        done = rig.run_trial(plan.program(plan.trials[0]), sink, drawn.seed, None, SYNC_HZ)
+    finally:
+        rig.close()
+    return Taken(devices, sink, done)
+
+
 def simulated(drawn: SceneDraw) -> Scene:
     """Simulate a scene.
 
     Raises:
         RigError: nothing slips in it.
     """
-    built = build_rig(changed(drawn.rig, {"faults": drawn.faults}))
-    built.poll_s = POLL_S
-    sink, plan = Memory(), _plan(drawn)
-    try:
-        built.connect()
-        built.frames.set_region(FRAMES_PX, FRAMES_PX)
-        done = built.run_trial(plan.program(plan.trials[0]), sink, drawn.seed, None, SYNC_HZ)
-    finally:
-        built.close()
-    truth = done.truth
-    assert truth is not None, "a simulated rig has a truth"
+    taken = take(drawn)
+    done, truth = taken.done, taken.truth
     begin_ns, end_ns = done.recorded_ns
     end_us = (end_ns - begin_ns) // 1000
     moved_ns = next(step.start_ns for step, _ in done.steps if step.phase == "slide")
@@ -163,7 +200,7 @@ def simulated(drawn: SceneDraw) -> Scene:
 
     slip = Slip(*(since(truth[key]) for key in ("first_slip_ns", "incipient_ns", "gross_ns")))
     end_us = min(end_us, slip.gross_us + AFTER_GROSS_US)
-    events = sink.taken("events", EventChunk)
+    events = taken.sink.taken("events", EventChunk)
     t_us = events.t_us - begin_ns // 1000
     inside = slice(*np.searchsorted(t_us, (0, end_us)))
     # copies: views would keep what follows in memory
@@ -173,7 +210,8 @@ def simulated(drawn: SceneDraw) -> Scene:
         events.p[inside].copy(),
         t_us[inside].copy(),
     )
-    size = built.events.width, built.events.height
+    camera = taken.devices.events
+    size = camera.width, camera.height
     return Scene(drawn.name, retained, *size, int(end_us), slip, drawn.world)
 
 

@@ -116,7 +116,11 @@ def _interval_note(found: BenchResult) -> str:
     if disturbed:
         text += f" and {max(disturbed)} with nuisances"
     few = few_words(min([worlds, *disturbed]))
-    return f"{text}; {few}." if few else f"{text}."
+    text = f"{text}; {few}." if few else f"{text}."
+    if found.limit is not None:
+        known = _median(found.limit.points[0].latency_ms)
+        text += f" An observer that knows the scene would need {known} ms."
+    return text
 
 
 def _tables(found: BenchResult) -> tuple[list[list[str]], list[list[str]]]:
