@@ -284,9 +284,16 @@ def _inner(annotation: Any) -> Any:
 
 
 def _tagged(candidates: Any, tag: str) -> Any:
-    for candidate in candidates if isinstance(candidates, list) else [candidates]:
-        for group in candidate if isinstance(candidate, list) else [candidate]:
-            for field in getattr(group, "model_fields", {}).values():
+    """Return the model that a tag chooses: of several that may hold the word, the first field's."""
+    every = [
+        group
+        for candidate in (candidates if isinstance(candidates, list) else [candidates])
+        for group in (candidate if isinstance(candidate, list) else [candidate])
+    ]
+    fields = [(group, list(getattr(group, "model_fields", {}).values())) for group in every]
+    for depth in (1, None):
+        for group, known in fields:
+            for field in known[:depth]:
                 if field.default == tag or tag in getattr(field.annotation, "__args__", ()):
                     return group
     return None

@@ -342,6 +342,7 @@ class TrialCollector:
         retakes = self.plan.protocol.collection.gates.retakes
         number = self.campaign.attempts().get(trial.id, 0)
         failed = self.campaign.failed_attempts().get(trial.id, 0)
+        self.retaken += number > 0  # by an earlier command
         while not self._attempt(trial, number):
             number += 1
             failed += 1

@@ -71,7 +71,7 @@ class MockArm:
         """Begin to follow `path`. Raises ArmFault, or RigError if moving."""
         state = self.state()
         if not state.healthy:
-            raise ArmFault("arm", f"cannot move: {state.value}")
+            raise ArmFault("arm", f"cannot move: {state.value}; {state.advice}")
         self._legs = self._world.start_arm(path)
 
     def progress(self) -> Progress:

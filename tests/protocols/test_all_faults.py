@@ -48,6 +48,18 @@ def test_faults_of_keys_in_several_sections_are_all_reported(tmp_path: Path) -> 
     assert "did you mean 'shuffled'?" in found["collection.order"]
 
 
+@pytest.mark.parametrize("phase", ["approach", "press", "hold", "slide", "release", "return"])
+def test_a_misspelt_key_of_a_phase_is_told_by_the_keys_of_that_phase(
+    tmp_path: Path, phase: str
+) -> None:
+    key = "duration" if phase == "hold" else "speed"
+    line = next(line for line in PILOT.splitlines() if f"phase: {phase}," in line)
+    found = faults(tmp_path, (line, line.replace(f"{key}:", f"{key}x:")))
+    (told,) = found.values()
+    assert f"did you mean '{key}'? (known here: phase," in told
+    assert "action" not in told
+
+
 def test_faults_of_text_keys_and_rules_are_reported_together(tmp_path: Path) -> None:
     found = faults(
         tmp_path,
