@@ -39,7 +39,7 @@ one after the other; 0 below, and while fewer than `fewest_places` of them move.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -114,6 +114,48 @@ class PapillaeSettings:
     fewest_places: int = FEWEST_PLACES
 
 
+@dataclass
+class _Recent:
+    """The latest events, in the order of time; adding some does not copy all.
+
+    Attributes:
+        ms, cell, on: of each event: millisecond, cell and whether it is ON; with room at the end.
+        begin, end: the part of them that is in use.
+    """
+
+    ms: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    cell: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    on: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    begin: int = 0
+    end: int = 0
+
+    def add(self, ms: I64, cell: I64, on: npt.NDArray[np.bool_]) -> None:
+        """Add later events."""
+        if self.end + len(ms) > len(self.ms):
+            held = self.end - self.begin
+            room = 2 * (held + len(ms))
+            for name in ("ms", "cell", "on"):
+                former = getattr(self, name)
+                larger = np.empty(room, former.dtype)
+                larger[:held] = former[self.begin : self.end]
+                setattr(self, name, larger)
+            self.begin, self.end = 0, held
+        part = slice(self.end, self.end + len(ms))
+        self.ms[part], self.cell[part], self.on[part] = ms, cell, on
+        self.end = part.stop
+
+    def forget(self, before: int) -> None:
+        """Drop the events of earlier milliseconds."""
+        self.begin += int(np.searchsorted(self.ms[self.begin : self.end], before))
+
+    def between(self, first: int, last: int | None) -> _Recent:
+        """Return the events of the milliseconds from `first` on, before `last` or to the end."""
+        held = self.ms[self.begin : self.end]
+        begin = self.begin + int(np.searchsorted(held, first))
+        end = self.end if last is None else self.begin + int(np.searchsorted(held, last))
+        return _Recent(self.ms[begin:end], self.cell[begin:end], self.on[begin:end])
+
+
 class Papillae(Detector):
     """Detector by the silence of single papillae; see the module."""
 
@@ -130,9 +172,9 @@ class Papillae(Detector):
             )
         self._cell_px = max(round(width / CELLS_ACROSS), 1)
         self._shape = -(-height // self._cell_px), -(-width // self._cell_px)
-        self._done = 0
-        self._ms, self._cell = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._on = np.zeros(0, np.bool_)
+        self._done = self._placed = 0
+        self._recent = _Recent()
+        self._events = np.zeros((2, self._shape[0] * self._shape[1]), np.int64)
         self._place = np.full(self._shape[0] * self._shape[1], -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._cells, self._unloaded = np.zeros(0), False
@@ -142,9 +184,8 @@ class Papillae(Detector):
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
         row, column = events.y // self._cell_px, events.x // self._cell_px
-        self._ms = np.concatenate([self._ms, events.t_us // BIN_US])
-        self._cell = np.concatenate([self._cell, row.astype(np.int64) * self._shape[1] + column])
-        self._on = np.concatenate([self._on, events.p > 0])
+        cell = row.astype(np.int64) * self._shape[1] + column
+        self._recent.add(events.t_us // BIN_US, cell, events.p > 0)
         first, last = self._done, int(until_us) // BIN_US
         value = np.zeros(last - first)
         at = first
@@ -152,16 +193,12 @@ class Papillae(Detector):
             if at % PLACES_MS == 0:
                 self._find_places(at)
             end = min(at - at % PLACES_MS + PLACES_MS, last)
-            if len(self._rest) >= self.settings.fewest_places:
-                self._advance(at, value[at - first : end - first])
-            else:
-                self._rest[:] = self._pushed[:] = 0.0
+            self._advance(at, value[at - first : end - first])
             if end % PLACES_MS == 0:
-                self._measure_dispersion(end)
+                self._measure_dispersion()
             at = end
         self._done = last
-        past = int(np.searchsorted(self._ms, last - SEEN_MS))
-        self._ms, self._cell, self._on = self._ms[past:], self._cell[past:], self._on[past:]
+        self._recent.forget(last - SEEN_MS - PLACES_MS)
         return Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
 
     def cost(self) -> Cost:
@@ -190,36 +227,55 @@ class Papillae(Detector):
     @property
     def recent_events(self) -> I64:
         """Events of each cell in the last quarter of a second."""
-        return np.bincount(self._cell, minlength=len(self._place))
-
-    def _between(self, first: int, last: int) -> slice:
-        """Return the events of the milliseconds from `first` on, before `last`."""
-        return slice(*np.searchsorted(self._ms, (first, last)))
+        recent = self._recent.between(self._done - SEEN_MS, None)
+        return np.bincount(recent.cell, minlength=len(self._place))
 
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
-        part = self._between(at - SEEN_MS, at)
-        seen = self._cell[part]
-        events = np.bincount(seen, minlength=len(self._place))
+        before, self._placed = self._placed, at
+        self._count(before, at, 1)
+        self._count(before - SEEN_MS, at - SEEN_MS, -1)
+        total, on = self._events
+        events = total.copy()
         if self.settings.hot:
             events[list(self.settings.hot)] = 0
         found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
         self._place, self._rest, self._pushed, self._noise, self._cells = found
-        on = self._on[part][self._place[seen] >= 0]
-        self._unloaded = len(on) > 0 and 1 - on.mean() >= UNLOADED
+        inside = self._place >= 0
+        seen = total[inside].sum()
+        self._unloaded = bool(seen > 0 and 1 - on[inside].sum() / seen >= UNLOADED)
+        shape = MEMORY_MS + GAP_MS + PLACES_MS, len(self._noise)
+        self._counts, self._back = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+        self._count_places(at - MEMORY_MS - GAP_MS, at)
+
+    def _count(self, first: int, last: int, sign: int) -> None:
+        """Add or take away the events of some milliseconds by cell: all, and those that are ON."""
+        some, cells = self._recent.between(first, last), len(self._place)
+        self._events[0] += sign * np.bincount(some.cell, minlength=cells)
+        self._events[1] += sign * np.bincount(some.cell[some.on], minlength=cells)
+
+    def _count_places(self, first: int, last: int) -> None:
+        """Count the events of some milliseconds by place: all, and those that are ON."""
+        some = self._recent.between(first, last)
+        oldest = self._placed - MEMORY_MS - GAP_MS
+        _count(some.ms, some.cell, oldest, self._place, self._counts)
+        if self._unloaded:
+            _count(some.ms[some.on], some.cell[some.on], oldest, self._place, self._back)
 
     def _advance(self, first: int, value: F64) -> None:
         """Write the evidence of the milliseconds from `first` on."""
-        oldest = first - MEMORY_MS - GAP_MS
-        part = self._between(oldest, first + len(value))
-        ms, cell, noise = self._ms[part], self._cell[part], self._noise
-        counts = _counts(ms, cell, oldest, len(value), self._place, noise)
+        self._count_places(first, first + len(value))
+        if len(self._rest) < self.settings.fewest_places:
+            self._rest[:] = self._pushed[:] = 0.0
+            return
+        at = first - self._placed
+        part = slice(at, at + MEMORY_MS + GAP_MS + len(value))
+        counts, noise = self._counts[part], self._noise
         scale, fewest = self._dispersion(), self.settings.fewest_places
         rest, pushed = self._rest, self._pushed
         if self._unloaded:
             rest[:] = self._age[:] = 0
-            on = self._on[part]
-            back = _counts(ms[on], cell[on], oldest, len(value), self._place, noise)
+            back = self._back[part]
             _advance_unloaded(counts, back, noise, self._cells, pushed, scale, fewest, value)
         else:
             _advance(counts, noise, rest, pushed, self._age, scale**2, fewest, value)
@@ -229,16 +285,11 @@ class Papillae(Detector):
         known = self._dispersions[~np.isnan(self._dispersions)]
         return max((known.sum() + PRIOR_DISPERSION) / (len(known) + 1), 1.0)
 
-    def _measure_dispersion(self, end: int) -> None:
+    def _measure_dispersion(self) -> None:
         """Compare the shares of the places in the last 10 ms with those of the memory."""
         found = np.nan
-        fewest = self.settings.fewest_places
+        fewest, counts = self.settings.fewest_places, self._counts
         if len(self._rest) >= fewest:
-            oldest = end - PLACES_MS - MEMORY_MS - GAP_MS
-            part = self._between(oldest, end)
-            counts = _counts(
-                self._ms[part], self._cell[part], oldest, PLACES_MS, self._place, self._noise
-            )
             n = counts[-PLACES_MS:].sum(axis=0)
             w = counts[PLACES_MS:-GAP_MS].sum(axis=0)
             n, w = n[w >= FEWEST_EVENTS], w[w >= FEWEST_EVENTS]
@@ -318,13 +369,11 @@ def _median(counts: I64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _counts(ms: I64, cell: I64, oldest: int, number: int, place: I64, noise: F64) -> I64:
-    """Return the events of each place in `number` milliseconds and the memory before them."""
-    counts = np.zeros((number + MEMORY_MS + GAP_MS, len(noise)), np.int64)
+def _count(ms: I64, cell: I64, oldest: int, place: I64, counts: I64) -> None:
+    """Count events by millisecond, the first row being `oldest`, and by place."""
     for k in range(len(ms)):
         if place[cell[k]] >= 0:
             counts[ms[k] - oldest, place[cell[k]]] += 1
-    return counts
 
 
 @njit(cache=True, nogil=True)
@@ -341,7 +390,8 @@ def _advance(
     """Advance the statistics of the places, and write the evidence.
 
     Args:
-        counts: as of `_counts`. noise: events a millisecond of each place.
+        counts: events of each place, in the memory, the gap and the milliseconds of `value`.
+        noise: events a millisecond of each place.
         rest, pushed: statistics, which are changed. scale: square of the dispersion.
         age: changed, shape (2,): milliseconds for which an object still counts as touching, and
             since enough places move. In the first ones all cause more events than before.
@@ -397,7 +447,7 @@ def _advance_unloaded(
     """Advance the statistics of places whose markers turn back, and write the evidence.
 
     Args:
-        counts, back: events, and those that are ON, as of `_counts`.
+        counts, back: as of `_advance`, and those that are ON.
         noise: events a millisecond of each place. cells: of each place.
         pushed: statistics, which are changed. scale: the dispersion.
         fewest: places that must move. value: of each millisecond.
