@@ -3,6 +3,9 @@
 The events of a simulated slide are sent again and again, each time later, in packets of 5 ms, as an
 event camera hands them over. What is timed is the call that ends a window: binning the packet, the
 network's spikes, the rule. Nothing waits for real time; the hour is the stream's.
+
+The detector by single papillae has the same slide with a million events a second, in packets of
+1 ms: what is timed is the call with a packet, whose evidence it returns.
 """
 
 from __future__ import annotations
@@ -16,15 +19,19 @@ import numpy as np
 
 from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
-from benchmarks.slides import slide_events
+from benchmarks.slides import HOLD_S, slide_events
+from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.live import LiveDetector
 from sliplab.analysis.detectors.network_detector import NetworkDetector
+from sliplab.analysis.detectors.papillae import LEAST, Papillae
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.windows import Windows
+from sliplab.storage.streams import EventChunk
 
-PACKET_US = 5_000
-HOUR_S = 3600.0
+PACKET_US, SHORT_US = 5_000, 1_000
+HOUR_S, DENSE_S, DENSE_HZ = 3600.0, 10.0, 1e6
+AROUND_US = 10_000
 
 
 def measure(seconds: float = HOUR_S) -> Figures:
@@ -64,4 +71,37 @@ def measure(seconds: float = HOUR_S) -> Figures:
         "decision_ms_max": float(ms.max()),
         "memory_growth_mb": memory[-1] - memory[tenth],
         "windows_given_up": float(live.losses.gaps),
+        **_papillae(),
+    }
+
+
+def _papillae() -> Figures:
+    """Milliseconds of a packet at a million events a second; whether evidence is as of one push."""
+    slide, rng = slide_events(), np.random.default_rng(SEED)
+    begin_us = int(slide.t_us[0]) + round(HOLD_S * 1e6)
+    count = round(DENSE_HZ * SHORT_US * 1e-6)
+    parts = []
+    for packet in range(round(DENSE_S * 1e6) // SHORT_US):
+        middle = begin_us + packet * SHORT_US
+        near = np.searchsorted(slide.t_us, (middle - AROUND_US, middle + AROUND_US))
+        some = slide[rng.integers(*near, count)]
+        t_us = packet * SHORT_US + np.sort(rng.integers(0, SHORT_US, count))
+        parts.append(replace(some, t_us=t_us))
+    live = LiveDetector(AtLevel(Papillae(), LEAST), origin_us=0)
+    wall, processor, values = [], [], []
+    with one_core():
+        for number, packet in enumerate(parts, 1):
+            started, used = time.perf_counter(), time.thread_time()
+            made = live.push(packet) + live.advance(number * SHORT_US)
+            wall.append(time.perf_counter() - started)
+            processor.append(time.thread_time() - used)
+            values += [decision.value for decision in made]
+    stored = Papillae()
+    stored.begin(640, 480)
+    whole = stored.push(EventChunk.concatenate(parts), len(parts) * SHORT_US)
+    return {
+        "papillae_ms_median": float(np.median(wall)) * 1e3,
+        "papillae_ms_p99": float(np.percentile(wall, 99)) * 1e3,
+        "papillae_processor_ms_p99": float(np.percentile(processor, 99)) * 1e3,
+        "papillae_equal": float(np.array_equal(values, whole.value)),
     }

@@ -39,7 +39,7 @@ one after the other; 0 below, and while fewer than `fewest_places` of them move.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +58,7 @@ SEEN_MS = 250
 """Time in which places are looked for: slow markers are rings only then."""
 PLACES_MS = 10
 """Interval of finding the places, and of measuring the dispersion."""
+KEPT_MS = SEEN_MS + PLACES_MS
 DISPERSION_MS = 60
 """Time over which the dispersion is averaged."""
 FEWEST_PLACES = 10
@@ -114,48 +115,6 @@ class PapillaeSettings:
     fewest_places: int = FEWEST_PLACES
 
 
-@dataclass
-class _Recent:
-    """The latest events, in the order of time; adding some does not copy all.
-
-    Attributes:
-        ms, cell, on: of each event: millisecond, cell and whether it is ON; with room at the end.
-        begin, end: the part of them that is in use.
-    """
-
-    ms: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
-    cell: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
-    on: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    begin: int = 0
-    end: int = 0
-
-    def add(self, ms: I64, cell: I64, on: npt.NDArray[np.bool_]) -> None:
-        """Add later events."""
-        if self.end + len(ms) > len(self.ms):
-            held = self.end - self.begin
-            room = 2 * (held + len(ms))
-            for name in ("ms", "cell", "on"):
-                former = getattr(self, name)
-                larger = np.empty(room, former.dtype)
-                larger[:held] = former[self.begin : self.end]
-                setattr(self, name, larger)
-            self.begin, self.end = 0, held
-        part = slice(self.end, self.end + len(ms))
-        self.ms[part], self.cell[part], self.on[part] = ms, cell, on
-        self.end = part.stop
-
-    def forget(self, before: int) -> None:
-        """Drop the events of earlier milliseconds."""
-        self.begin += int(np.searchsorted(self.ms[self.begin : self.end], before))
-
-    def between(self, first: int, last: int | None) -> _Recent:
-        """Return the events of the milliseconds from `first` on, before `last` or to the end."""
-        held = self.ms[self.begin : self.end]
-        begin = self.begin + int(np.searchsorted(held, first))
-        end = self.end if last is None else self.begin + int(np.searchsorted(held, last))
-        return _Recent(self.ms[begin:end], self.cell[begin:end], self.on[begin:end])
-
-
 class Papillae(Detector):
     """Detector by the silence of single papillae; see the module."""
 
@@ -173,9 +132,11 @@ class Papillae(Detector):
         self._cell_px = max(round(width / CELLS_ACROSS), 1)
         self._shape = -(-height // self._cell_px), -(-width // self._cell_px)
         self._done = self._placed = 0
-        self._recent = _Recent()
-        self._events = np.zeros((2, self._shape[0] * self._shape[1]), np.int64)
-        self._place = np.full(self._shape[0] * self._shape[1], -1)
+        cells = self._shape[0] * self._shape[1]
+        self._held = EventChunk.empty()
+        self._kept = np.zeros((KEPT_MS, 2, cells), np.uint32)
+        self._events = np.zeros((2, cells), np.int64)
+        self._place = np.full(cells, -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._cells, self._unloaded = np.zeros(0), False
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
@@ -183,23 +144,28 @@ class Papillae(Detector):
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
-        row, column = events.y // self._cell_px, events.x // self._cell_px
-        cell = row.astype(np.int64) * self._shape[1] + column
-        self._recent.add(events.t_us // BIN_US, cell, events.p > 0)
+        events = EventChunk.concatenate([self._held, events]) if len(self._held) else events
+        cells = self._cells_of(events)
+        ms, on = events.t_us // BIN_US, events.p > 0
         first, last = self._done, int(until_us) // BIN_US
         value = np.zeros(last - first)
-        at = first
+        at, done = first, 0
         while at < last:
             if at % PLACES_MS == 0:
                 self._find_places(at)
             end = min(at - at % PLACES_MS + PLACES_MS, last)
+            part = slice(done, done := int(np.searchsorted(ms, end)))
+            _keep(ms[part], cells[part], on[part], at, end, self._kept)
             self._advance(at, value[at - first : end - first])
             if end % PLACES_MS == 0:
                 self._measure_dispersion()
             at = end
-        self._done = last
-        self._recent.forget(last - SEEN_MS - PLACES_MS)
+        self._done, self._held = last, events[done:]
         return Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
+
+    def _cells_of(self, events: EventChunk) -> I64:
+        row, column = events.y // self._cell_px, events.x // self._cell_px
+        return row.astype(np.int64) * self._shape[1] + column
 
     def cost(self) -> Cost:
         """Return the operations of a millisecond with 20 places, and the bytes of its numbers.
@@ -227,14 +193,15 @@ class Papillae(Detector):
     @property
     def recent_events(self) -> I64:
         """Events of each cell in the last quarter of a second."""
-        recent = self._recent.between(self._done - SEEN_MS, None)
-        return np.bincount(recent.cell, minlength=len(self._place))
+        found = np.zeros_like(self._events)
+        _add(self._kept, 1, self._done - SEEN_MS, self._done, found)
+        return found[0] + np.bincount(self._cells_of(self._held), minlength=found.shape[1])
 
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
         before, self._placed = self._placed, at
-        self._count(before, at, 1)
-        self._count(before - SEEN_MS, at - SEEN_MS, -1)
+        _add(self._kept, 1, before, at, self._events)
+        _add(self._kept, -1, before - SEEN_MS, at - SEEN_MS, self._events)
         total, on = self._events
         events = total.copy()
         if self.settings.hot:
@@ -246,21 +213,14 @@ class Papillae(Detector):
         self._unloaded = bool(seen > 0 and 1 - on[inside].sum() / seen >= UNLOADED)
         shape = MEMORY_MS + GAP_MS + PLACES_MS, len(self._noise)
         self._counts, self._back = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+        self._placed_cells = np.flatnonzero(inside)
         self._count_places(at - MEMORY_MS - GAP_MS, at)
-
-    def _count(self, first: int, last: int, sign: int) -> None:
-        """Add or take away the events of some milliseconds by cell: all, and those that are ON."""
-        some, cells = self._recent.between(first, last), len(self._place)
-        self._events[0] += sign * np.bincount(some.cell, minlength=cells)
-        self._events[1] += sign * np.bincount(some.cell[some.on], minlength=cells)
 
     def _count_places(self, first: int, last: int) -> None:
         """Count the events of some milliseconds by place: all, and those that are ON."""
-        some = self._recent.between(first, last)
         oldest = self._placed - MEMORY_MS - GAP_MS
-        _count(some.ms, some.cell, oldest, self._place, self._counts)
-        if self._unloaded:
-            _count(some.ms[some.on], some.cell[some.on], oldest, self._place, self._back)
+        for kind, counts in enumerate((self._counts, self._back)[: 1 + self._unloaded]):
+            _count(self._kept, kind, first, last, oldest, self._placed_cells, self._place, counts)
 
     def _advance(self, first: int, value: F64) -> None:
         """Write the evidence of the milliseconds from `first` on."""
@@ -369,11 +329,58 @@ def _median(counts: I64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _count(ms: I64, cell: I64, oldest: int, place: I64, counts: I64) -> None:
-    """Count events by millisecond, the first row being `oldest`, and by place."""
+def _keep(
+    ms: I64,
+    cell: I64,
+    on: npt.NDArray[np.bool_],
+    first: int,
+    last: int,
+    kept: npt.NDArray[np.uint32],
+) -> None:
+    """Count the events of the milliseconds from `first` on, before `last`, in place of the oldest.
+
+    Args:
+        kept: by millisecond, modulo its length; all events and those that are ON; and cell.
+    """
+    for k in range(first, last):
+        kept[k % len(kept)] = 0
     for k in range(len(ms)):
-        if place[cell[k]] >= 0:
-            counts[ms[k] - oldest, place[cell[k]]] += 1
+        row = kept[ms[k] % len(kept)]
+        row[0, cell[k]] += 1
+        if on[k]:
+            row[1, cell[k]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _add(kept: npt.NDArray[np.uint32], sign: int, first: int, last: int, events: I64) -> None:
+    """Add the events of some milliseconds to `events`, or take them away; shapes as of `_keep`."""
+    for ms in range(max(first, 0), last):
+        for kind in range(2):
+            row, to = kept[ms % len(kept), kind], events[kind]
+            for cell in range(len(row)):
+                to[cell] += sign * np.int64(row[cell])
+
+
+@njit(cache=True, nogil=True)
+def _count(
+    kept: npt.NDArray[np.uint32],
+    kind: int,
+    first: int,
+    last: int,
+    oldest: int,
+    cells: I64,
+    place: I64,
+    counts: I64,
+) -> None:
+    """Count the events of some milliseconds by place, the first row of `counts` being `oldest`.
+
+    Args:
+        kept: as of `_keep`, and which `kind` of them. cells: that have a place.
+    """
+    for ms in range(max(first, 0), last):
+        row, to = kept[ms % len(kept), kind], counts[ms - oldest]
+        for cell in cells:
+            to[place[cell]] += row[cell]
 
 
 @njit(cache=True, nogil=True)
