@@ -76,6 +76,30 @@ class Definition:
 
 
 DEFINITION = Definition()
+FRICTION, SCENE, CONTACT = ("scene", "friction"), ("scene",), ("scene", "contact")
+EFFECTS: dict[str, dict[tuple[str, ...], Span | int]] = {
+    "creep": {
+        (*FRICTION, "creep_mm_s"): Span(0.05, 0.5, True),
+        (*FRICTION, "creep_share"): Span(0.02, 0.1, True),
+    },
+    "stick-slip": {
+        (*FRICTION, "static_excess"): Span(0.05, 0.3, True),
+        (*FRICTION, "least_mm_s"): Span(0.5, 4.0, True),
+        (*SCENE, "step_ms"): 1,  # markers move on cubics through the rows: a jump blurs over three
+    },
+    "texture": {
+        (*FRICTION, "path_variation"): Span(0.05, 0.2, True),
+        (*FRICTION, "correlation_mm"): Span(0.2, 2.0, True),
+    },
+    "curved": {
+        (*SCENE, "plate_radius_mm"): Span(600.0, 4000.0, True),
+        (*CONTACT, "tilt_deg"): Span(0.2, 1.0, True),
+        (*CONTACT, "tilt_axis_deg"): Span(0.0, 360.0),
+    },
+}
+"""Harder worlds: keys of the simulated rig that an effect draws, in every world."""
+WORLDS = {"usual": (), **{name: (name,) for name in EFFECTS}, "hard": tuple(EFFECTS)}
+"""Effects of each set of worlds. Those of `usual` are version 2 to the bit."""
 SIZES = {
     "full": Size(ScenePart(16, 9, 0), ScenePart(12, 8, 120), ScenePart(16, 12, 30), 4),
     "small": Size(ScenePart(4, 4, 0), ScenePart(4, 4, 2), ScenePart(6, 4, 2), 1),

@@ -109,6 +109,7 @@ class BenchResult(Document):
 
     Attributes:
         version: of the bench's scenes. size: which set of them. seed: of the test worlds.
+        worlds: which set of effects; `usual` in older results.
         scenes: their number by part. hours: without slip, of validation and test scenes.
         detectors: the best first.
         limit: what an observer that knows the scene would need; None in older results.
@@ -118,6 +119,7 @@ class BenchResult(Document):
     version: Int
     size: str
     seed: Int
+    worlds: str = "usual"
     scenes: dict[str, Int]
     hours: dict[str, Number]
     detectors: tuple[BenchDetector, ...]
@@ -126,4 +128,6 @@ class BenchResult(Document):
     @property
     def command(self) -> str:
         """Command that makes it."""
-        return f"sliplab bench{' --small' if self.size == 'small' else ''} --seed {self.seed}"
+        small = " --small" if self.size == "small" else ""
+        worlds = "" if self.worlds == "usual" else f" --worlds {self.worlds}"
+        return f"sliplab bench{small}{worlds} --seed {self.seed}"

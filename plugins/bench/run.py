@@ -33,7 +33,7 @@ from sliplab.flows.running import console, stopping
 from sliplab.plugins.bench import scenes
 from sliplab.plugins.bench.apart import ApartDetector
 from sliplab.plugins.bench.audit import audit, drawn_edges
-from sliplab.plugins.bench.definition import SIZES, VERSION, Size
+from sliplab.plugins.bench.definition import SIZES, VERSION, WORLDS, Size
 from sliplab.plugins.bench.document import (
     BenchDetector,
     BenchLimit,
@@ -163,11 +163,13 @@ class BenchScenes:
     """The scenes of one size and seed, simulated when they are first needed.
 
     Attributes:
+        worlds: one of `WORLDS`.
         advance: called after each simulated scene.
     """
 
     size: Size
     seed: int
+    worlds: str = "usual"
     advance: Advance = lambda: None
 
     @property
@@ -185,15 +187,15 @@ class BenchScenes:
     @cached_property
     def training(self) -> TrainingScenes:
         """Scenes that train and choose."""
-        train, validation = scenes.training_scenes(self.size)
+        train, validation = scenes.training_scenes(self.size, self.worlds)
         return TrainingScenes(self._simulated(train), self._simulated(validation))
 
     @cached_property
     def tests(self) -> Tests:
         """Test scenes."""
-        nuisances = scenes.nuisance_scenes(self.size, self.seed)
+        nuisances = scenes.nuisance_scenes(self.size, self.seed, self.worlds)
         return Tests(
-            self._simulated(scenes.test_scenes(self.size, self.seed)),
+            self._simulated(scenes.test_scenes(self.size, self.seed, self.worlds)),
             {name: self._simulated(drawn) for name, drawn in nuisances.items()},
         )
 
@@ -241,12 +243,13 @@ class DetectorJob:
     name: str
     size: Size
     seed: int
+    worlds: str = "usual"
 
 
 @lru_cache(maxsize=1)
-def _bench(size: Size, seed: int) -> BenchScenes:
+def _bench(size: Size, seed: int, worlds: str) -> BenchScenes:
     """Return the scenes; a process simulates them once."""
-    return BenchScenes(size, seed)
+    return BenchScenes(size, seed, worlds)
 
 
 def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
@@ -255,7 +258,7 @@ def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
     Raises:
         InputError: it breaks the rules of the bench.
     """
-    bench = _bench(job.size, job.seed)
+    bench = _bench(job.size, job.seed, job.worlds)
     bench.advance = advance or (lambda: None)
     detector = None
     try:
@@ -279,7 +282,7 @@ def _judge_each(
         done: called with each as soon as it is complete.
     """
     if min(workers, len(jobs)) < 2:
-        scenes_of = _bench(jobs[0].size, jobs[0].seed)
+        scenes_of = _bench(jobs[0].size, jobs[0].seed, jobs[0].worlds)
         total = scenes_of.count + len(jobs) * scenes_of.fed
         with console.bar("bench (scenes, simulated)", total) as bar:
             for job in jobs:
@@ -302,19 +305,19 @@ def _judge_each(
             raise
 
 
-def find_limit(size: Size, seed: int) -> BenchLimit:
+def find_limit(size: Size, seed: int, worlds: str = "usual") -> BenchLimit:
     """Return what an observer that knows the scenes would need, over the test slides."""
-    drawn = [it for it in scenes.test_scenes(size, seed) if it.hold_s * 1e6 < LONG_US]
+    drawn = [it for it in scenes.test_scenes(size, seed, worlds) if it.hold_s * 1e6 < LONG_US]
     waits = []
     with console.bar("limit (slides, simulated)", len(drawn)) as bar:
         for slide in drawn:
             waits.append(waits_ms(slide, RATES))
             bar.advance()
-    worlds = [slide.world for slide in drawn]
+    names = [slide.world for slide in drawn]
     return BenchLimit(
         slides=len(drawn),
         points=tuple(
-            LimitPoint(asked=asked, latency_ms=median_latency(late, worlds))
+            LimitPoint(asked=asked, latency_ms=median_latency(late, names))
             for asked, late in zip(RATES, zip(*waits, strict=True), strict=True)
         ),
     )
@@ -337,7 +340,12 @@ def _drawn_seed(folder: Path) -> int:
 
 
 def run_bench(
-    names: Sequence[str], size: str, seed: int | None, folder: Path, workers: int = 1
+    names: Sequence[str],
+    size: str,
+    seed: int | None,
+    folder: Path,
+    workers: int = 1,
+    worlds: str = "usual",
 ) -> BenchResult:
     """Evaluate detectors without a result; return the table of all that are named.
 
@@ -346,9 +354,10 @@ def run_bench(
         seed: of the test worlds; None: that of the folder, and drawn where it has none.
         folder: keeps what a detector gave.
         workers: processes at the most; each simulates the scenes for itself.
+        worlds: one of `WORLDS`.
 
     Raises:
-        InputError: there is no such detector, it breaks the rules of the bench, or `folder` is a
+        InputError: there are no such worlds or detector, it breaks the rules, or `folder` is a
             file.
     """
     if folder.exists() and not folder.is_dir():
@@ -358,13 +367,14 @@ def run_bench(
         raise InputError("DETECTOR", "", twice, "must be named once")
     for name in names:
         make_detector(name).close()  # wrong input fails before anything is simulated
+    if worlds not in WORLDS:
+        raise InputError("--worlds", "", worlds, f"must be one of {', '.join(WORLDS)}")
     saved = Derived(folder / "detectors")
     if seed is None:
         seed = _drawn_seed(folder)
-    keys = {
-        name: make_key("bench", VERSION, [name, contents(name)], [ENTRIES_VERSION, size, seed])
-        for name in names
-    }
+    # the usual worlds keep the key that they had before there were others
+    scene_key = [ENTRIES_VERSION, size, seed, *([] if worlds == "usual" else [worlds])]
+    keys = {name: make_key("bench", VERSION, [name, contents(name)], scene_key) for name in names}
 
     def keep(found: KeptDetector) -> None:
         key = keys[found.row.name]
@@ -372,19 +382,21 @@ def run_bench(
 
     missing = [name for name, key in keys.items() if not saved.fresh(key[:16], key)]
     if missing:
-        _judge_each([DetectorJob(name, SIZES[size], seed) for name in missing], workers, keep)
+        jobs = [DetectorJob(name, SIZES[size], seed, worlds) for name in missing]
+        _judge_each(jobs, workers, keep)
     limit = Derived(folder / "limits")
-    of_size = make_key("limit of the bench", VERSION, [size, seed], [LIMIT_VERSION])
-    if not limit.fresh(of_size[:16], of_size):
-        limit.write(of_size[:16], of_size, find_limit(SIZES[size], seed))
+    of_scenes = make_key("limit of the bench", VERSION, [worlds], [LIMIT_VERSION, size, seed])
+    if not limit.fresh(of_scenes[:16], of_scenes):
+        limit.write(of_scenes[:16], of_scenes, find_limit(SIZES[size], seed, worlds))
     found = [saved.load(key[:16], KeptDetector) for key in keys.values()]
     return BenchResult(
         simulated=True,
         version=VERSION,
         size=size,
         seed=seed,
+        worlds=worlds,
         scenes=BenchScenes(SIZES[size], seed).counts,
         hours=found[0].hours,
         detectors=tuple(ranked([one.row for one in found])),
-        limit=limit.load(of_size[:16], BenchLimit),
+        limit=limit.load(of_scenes[:16], BenchLimit),
     )

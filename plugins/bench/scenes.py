@@ -5,12 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sliplab.analysis.detectors.detector import Scene, Slip
 from sliplab.flows.scene_runs import Memory, changed, with_true_times
-from sliplab.plugins.bench.definition import DEFINITION, VERSION, ScenePart, Size, Span
+from sliplab.plugins.bench.definition import (
+    DEFINITION,
+    EFFECTS,
+    VERSION,
+    WORLDS,
+    ScenePart,
+    Size,
+    Span,
+)
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
 from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan
@@ -58,18 +67,22 @@ class SceneDraw:
     faults: tuple[AnyFault, ...] = ()
 
 
-def training_scenes(size: Size) -> tuple[list[SceneDraw], list[SceneDraw]]:
-    """Return the scenes that train and that choose, the same for everybody."""
-    train = list(_part("train", size.train, DEFINITION.train_seed))
-    return train, list(_part("validation", size.validation, DEFINITION.validation_seed))
+def training_scenes(size: Size, worlds: str = "usual") -> tuple[list[SceneDraw], list[SceneDraw]]:
+    """Return the scenes that train and that choose, the same for everybody.
+
+    Args:
+        worlds: one of `WORLDS`.
+    """
+    train = list(_part("train", size.train, DEFINITION.train_seed, worlds))
+    return train, list(_part("validation", size.validation, DEFINITION.validation_seed, worlds))
 
 
-def test_scenes(size: Size, seed: int) -> list[SceneDraw]:
+def test_scenes(size: Size, seed: int, worlds: str = "usual") -> list[SceneDraw]:
     """Return test scenes in worlds that a seed draws."""
-    return list(_part("test", size.test, hash_integer("bench test", VERSION, seed)))
+    return list(_part("test", size.test, hash_integer("bench test", VERSION, seed), worlds))
 
 
-def nuisance_scenes(size: Size, seed: int) -> dict[str, list[SceneDraw]]:
+def nuisance_scenes(size: Size, seed: int, worlds: str = "usual") -> dict[str, list[SceneDraw]]:
     """Return scenes with each nuisance, in worlds that a seed draws."""
     drawn_by = hash_integer("bench nuisances", VERSION, seed)
     found: dict[str, list[SceneDraw]] = {}
@@ -79,16 +92,16 @@ def nuisance_scenes(size: Size, seed: int) -> dict[str, list[SceneDraw]]:
             rng = np.random.default_rng([drawn_by, place, number])
             hold_s = _value(DEFINITION.nuisance_hold_s, rng)
             chance = np.random.default_rng([drawn_by, number, hash_integer(name)])
-            rig = _world(drawn_by, place * size.nuisance + number)
+            rig = _world(drawn_by, place * size.nuisance + number, worlds)
             faults = nuisance_faults(name, hold_s, scene_of(rig), chance)
             world = f"{name} {number + 1}"
             found[name].append(_drawn(world, world, rig, hold_s, rng, faults))
     return found
 
 
-def _part(name: str, part: ScenePart, seed: int) -> Iterator[SceneDraw]:
-    worlds = [_world(seed, number) for number in range(part.worlds)]
-    for number, rig in enumerate(worlds):
+def _part(name: str, part: ScenePart, seed: int, worlds: str) -> Iterator[SceneDraw]:
+    rigs = [_world(seed, number, worlds) for number in range(part.worlds)]
+    for number, rig in enumerate(rigs):
         for slide in range(part.slides):
             rng = np.random.default_rng([seed, number, slide])
             hold_s = _value(DEFINITION.hold_s, rng)
@@ -98,16 +111,26 @@ def _part(name: str, part: ScenePart, seed: int) -> Iterator[SceneDraw]:
         rng = np.random.default_rng([seed, hold, hash_integer("hold")])
         hold_s = _value(DEFINITION.long_hold_s, rng)
         world = f"{name} hold {hold + 1}"
-        yield _drawn(world, world, _world(seed, part.worlds + hold), hold_s, rng)
+        yield _drawn(world, world, _world(seed, part.worlds + hold, worlds), hold_s, rng)
 
 
-def _world(seed: int, number: int) -> RigFile:
+def _world(seed: int, number: int, worlds: str) -> RigFile:
     """Return a simulated rig with other parameters, another skin and an error of depth zero."""
     rig, _ = load_rig_file(shipped_rigs()[DEFINITION.rig])
     values = Prior(rig, DEFINITION.spread, seed).values(number)
     rng = np.random.default_rng([seed, number, hash_integer("specimen")])
     zero_mm = float(rng.uniform(-ZERO_MM, ZERO_MM))
-    return with_true_times(other_specimen(rig, values, int(rng.integers(2**31)), zero_mm))
+    made = with_true_times(other_specimen(rig, values, int(rng.integers(2**31)), zero_mm))
+    for effect in WORLDS[worlds]:
+        drawn_by = np.random.default_rng([seed, number, hash_integer(effect)])
+        for (*sections, key), span in EFFECTS[effect].items():
+            settings: dict[str, Any] = {
+                key: _value(span, drawn_by) if isinstance(span, Span) else span
+            }
+            for section in reversed(sections):
+                settings = {section: settings}
+            made = changed(made, settings)
+    return made
 
 
 def _drawn(

@@ -53,6 +53,13 @@ def measure(
         ),
     ] = None,
     small: Annotated[bool, typer.Option("--small", help="Fewer scenes, for a first look.")] = False,
+    worlds: Annotated[
+        str,
+        typer.Option(
+            "--worlds",
+            help="Worlds of the scenes: usual, creep, stick-slip, texture, curved, or hard: all.",
+        ),
+    ] = "usual",
     folder: Annotated[
         Path, typer.Option("--folder", help="Keeps the results, so that a run resumes.")
     ] = Path("sliplab-bench"),
@@ -74,7 +81,7 @@ def measure(
     if leaderboard is not None:
         _around(leaderboard)  # wrong input fails before anything is simulated
     size, names = "small" if small else "full", detectors or (*CORE, *PLUGIN.detectors)
-    found = run_bench(names, size, seed, folder, workers or os.cpu_count() or 1)
+    found = run_bench(names, size, seed, folder, workers or os.cpu_count() or 1, worlds)
     svg = latency_against_alarms(found)
     if leaderboard is not None:
         _write_leaderboard(leaderboard, found, svg)
@@ -86,7 +93,9 @@ def shown(found: BenchResult, plot: Path) -> Iterator[Table | str]:
     """Yield the table, the note on its intervals, and where the plot is."""
     from sliplab.analysis.report.page import Table
 
-    title = f"bench {found.version}, {found.size}, seed {found.seed} (simulated)"
+    title = (
+        f"bench {found.version}, {found.size}, seed {found.seed}, {found.worlds} worlds (simulated)"
+    )
     yield Table(COLUMNS, [_row(row) for row in found.detectors], title)
     yield _interval_note(found)
     yield f"Latency against false alarms (simulated): {plot.resolve()}"

@@ -332,6 +332,10 @@ def springs_of(settings: MockSettings, skin: Skin, seed: int) -> Springs:
         static_excess=friction.static_excess,
         strengthening=friction.strengthening,
         weak_mm_s=friction.weak_mm_s,
+        creep_mm_s=friction.creep_mm_s,
+        creep_share=friction.creep_share,
+        least_mm_s=friction.least_mm_s,
+        curvature=0.0 if scene.plate_radius_mm is None else 1.0 / scene.plate_radius_mm,
         relaxation_share=scene.skin.relaxation_share,
         relaxation_s=scene.skin.relaxation_s,
     )

@@ -111,6 +111,12 @@ class Friction(StrictModel):
     strengthening: NonNegative = 0.01
     """Friction at sliding speed w is kinetic times 1 + strengthening ln(1 + w / weak_mm_s)."""
     weak_mm_s: Positive = 0.1
+    creep_mm_s: NonNegative = 0.0
+    """Speed at which a stuck tip creeps at its limit; 0: it does not creep."""
+    creep_share: Annotated[float, Field(gt=0, le=0.1)] = 0.05
+    """Share of the limit over which the speed of creep falls by e."""
+    least_mm_s: NonNegative = 0.0
+    """A tip that slides slower sticks again (stick-slip); 0: it sticks when it rests."""
     path_variation: Annotated[float, Field(ge=0, le=0.3)] = 0.05
     """Relative standard deviation of friction along each tip's path, drawn for every trial."""
     correlation_mm: Positive = 0.5
@@ -171,6 +177,8 @@ class SceneSettings(StrictModel):
     friction: Friction = Friction()
     plate: MockPlateSettings = MockPlateSettings()
     contact: PlatePosition = PlatePosition()
+    plate_radius_mm: Positive | None = None
+    """Of a plate that is convex towards the sensor, highest at its origin; null: flat."""
 
 
 class MockEventCameraSettings(EventOptics):

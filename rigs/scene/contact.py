@@ -47,6 +47,7 @@ from sliplab.rigs.scene.slip import (
     bend_for,
     bend_step,
     column,
+    creep_slip,
     first_bend,
     first_slip,
     force_after,
@@ -232,6 +233,10 @@ def respond(
     for _ in range(ITERATIONS):
         if _bend(w) == 0:
             break
+    if law.creep_mm_s > 0.0 and _creep(w, law, count, step) > 0:
+        for _ in range(ITERATIONS):
+            if _bend(w) == 0:
+                break
     slides, rare = _decide(w, law, step)
     if slides > 0:
         _slide(w, field, law, first, count, step, rare)
@@ -259,10 +264,12 @@ def _approach(
     stale, touching = 0, 0
     for j in range(LANES):
         lx, ly = w.layout_x[j], w.layout_y[j]
-        deep = depth + slope_x * lx + slope_y * ly - w.gap[j]
         # without a turn these are x + lx and y + ly to the bit
         w.to_x[j] = x + (cosine * lx - sine * ly)
         w.to_y[j] = y + (cosine * ly + sine * lx) - plate_y
+        away_x, away_y = w.to_x[j], w.to_y[j]
+        bulge = 0.5 * law.curvature * (away_x * away_x + away_y * away_y)
+        deep = depth + slope_x * lx + slope_y * ly - w.gap[j] - bulge
         w.deep[j] = deep
         place_x, place_y = w.place_x[j], w.place_y[j]
         w.foot_x[j], w.foot_y[j] = place_x, place_y
@@ -333,6 +340,36 @@ def _bend(w: Block) -> int:
         w.seeks[j] = 1.0 if still else 0.0
         seek += 1 if still else 0
     return seek
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _creep(w: Block, law: Law, count: int, step: ContactStep) -> int:
+    """Move the tips that stick as far as they creep; return how many seek another bend."""
+    crept, static = 0, 1.0 + law.static_excess
+    for j in range(count):
+        if w.mode[j] != STUCK or not (w.deep[j] > 0.0 and w.pressed[j] > 0.0):
+            continue
+        new_x, new_y = w.to_x[j] - w.foot_x[j], w.to_y[j] - w.foot_y[j]
+        soft, stretch = w.soft[j], w.stretch[j]
+        force, normal, slope, _ = column(
+            w.end_bent[j], w.bending[j], w.shorter[j], w.pressed[j], w.along[j]
+        )
+        secant = force / stretch if stretch > 0.0 else 0.0
+        x = secant * new_x + w.branch_x[j] * step.decay + soft * (new_x - w.old_x[j])
+        y = secant * new_y + w.branch_y[j] * step.decay + soft * (new_y - w.old_y[j])
+        y += w.across[j] * law.damping_s * step.swerve
+        end, start = np.sqrt(x * x + y * y), np.sqrt(w.force_x[j] ** 2 + w.force_y[j] ** 2)
+        if end == 0.0:
+            continue
+        grip, _ = grip_between(w.path[j], w.knot[j], w.c0[j], w.c1[j], w.c2[j], w.c3[j])
+        limit = static * grip
+        steepness = slope / (1.0 + w.compliance[j] * slope) + soft
+        slip = creep_slip(start, end, limit * w.normal[j], limit * normal, steepness, step.h, law)
+        w.foot_x[j] += slip * x / end
+        w.foot_y[j] += slip * y / end
+        _load(w, law, j, step.h, step.decay, step.gain)
+        crept += 1
+    return crept
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -409,6 +446,8 @@ def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
         speed, earlier = slip / part if slip > 0.0 else 0.0, w.speed[j]
         # a tip that just let go, or slows down fast, differs from its state a step ago
         steady = slip > 0.0 and share < 0.0 and is_steady(earlier, speed)
+        if end == SLIDING and w.quick[j] * slip + w.lag[j] < law.least_mm_s:
+            w.mode[j], speed, steady = STUCK, 0.0, False
         w.earlier[j] = earlier if steady and w.slid_s[j] == h else -1.0
         w.slid_s[j], w.speed[j] = h if steady else 0.0, speed
         w.path[j] += slip

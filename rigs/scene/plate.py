@@ -171,6 +171,10 @@ def advance_free(
         law.relaxation_s,
         law.damping_s,
         law.exact_turns,
+        law.creep_mm_s,
+        law.creep_share,
+        law.least_mm_s,
+        law.curvature,
     )
     step_ns, h, decay, gain, new, stiffness = np.int64(0), 0.0, 1.0, 1.0, 0.5, 0.0
     for i in range(n):
@@ -241,7 +245,7 @@ def advance_free(
             if ns < 1 or ns == step_ns or height <= stop:
                 break
             # the step ends where the first tip lets go, and its rest is another
-            at = _between(blocks[0], motion[0], sensor[k], share)
+            at = _between(blocks[0], law, motion[0], sensor[k], share)
             part = ns * 1e-9
             decay, gain = relaxing(part, law.relaxation_s)
             move_tips(
@@ -264,7 +268,7 @@ def advance_free(
             share = _lands_at(motion[0] - stop, mean * h, (mean - speed) * h)
             ns = min(max(np.int64(np.ceil(share * step_ns)), np.int64(1)), step_ns)
             share = ns / step_ns
-            at = _between(blocks[0], motion[0], sensor[k], share)
+            at = _between(blocks[0], law, motion[0], sensor[k], share)
             t_ns[k + 1] = begin_ns + ns
             h = ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
@@ -294,14 +298,16 @@ def _lets_go_first(blocks: Blocks, n: int) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _between(w: Block, plate_y: float, sensor: F64, share: float) -> F64:
+def _between(w: Block, law: Law, plate_y: float, sensor: F64, share: float) -> F64:
     """The sensor's pose at a share of a step, from where the first tip's base was; (5,)."""
     at = sensor.copy()
     x, y = w.layout_x[0], w.layout_y[0]
     left = 1.0 - share
     at[0] -= left * (sensor[0] - (w.base_x[0] - x))
     at[1] -= left * (sensor[1] - (w.base_y[0] - y + plate_y))
-    deep = sensor[2] + sensor[3] * x + sensor[4] * y - w.gap[0]
+    away_x, away_y = w.base_x[0], w.base_y[0]
+    bulge = 0.5 * law.curvature * (away_x * away_x + away_y * away_y)
+    deep = sensor[2] + sensor[3] * x + sensor[4] * y - w.gap[0] - bulge
     # a tip that was never moved does not know how deep it was
     at[2] -= left * (deep - w.indentation[0]) if w.indentation[0] == w.indentation[0] else 0.0
     return at

@@ -431,6 +431,36 @@ def predicted_speed(
     return weight * per_s, lag, slides
 
 
+_MOST_CREEP = 40.0
+"""Logarithm of a creep speed over that at the limit: far beyond it, where the tip lets go."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def creep_slip(
+    start: float, end: float, before: float, after: float, steepness: float, h: float, law: Law
+) -> float:
+    """Return how far a stuck tip creeps in a step of `h` s, mm.
+
+    With x = (|f| / limit - 1) / creep_share the speed is creep_mm_s e^x, and x' = a - b e^x while
+    rates are constant: a linear equation for e^-x, solved exactly.
+
+    Args:
+        start, end: size of the force at both ends if the tip does not creep, N.
+        before, after: static limit at both ends, N.
+        steepness: by how much the force falls with the slip, N/mm.
+    """
+    first = (start / before - 1.0) / law.creep_share if before > 0.0 else -1.0 / law.creep_share
+    last = (end / after - 1.0) / law.creep_share if after > 0.0 else -1.0 / law.creep_share
+    first, last = min(first, _MOST_CREEP), min(last, _MOST_CREEP)
+    rise = last - first
+    # the mean of e^x on the way, without cancellation
+    even = abs(rise) < 1e-6
+    mean = np.exp(last) * (1.0 if even else -np.expm1(-rise) / rise)
+    length = law.creep_share * after / steepness
+    # never beyond the place at which the spring is loose
+    return min(length * np.log1p(law.creep_mm_s * h / length * mean), end / steepness)
+
+
 _LEAST_STIFFNESS = 0.05
 ITERATIONS = 60
 CLOSE = 1e-7

@@ -5,7 +5,8 @@ A scene should hold only the physics that it needs, so the physics come in level
 L0  closed-form onsets, for labels and plans only (`rigs.scene.onsets`).
 L1  linear springs with Coulomb friction: return mapping.
 L2  and large deflection: a bent papilla is shorter, and an axially loaded one softer (buckling).
-L3  and relaxation after pressing, static over kinetic friction, friction rising with speed.
+L3  and relaxation after pressing, static over kinetic friction, friction rising with speed, creep,
+    stick-slip.
 """
 
 from __future__ import annotations
@@ -65,6 +66,15 @@ class Law(NamedTuple):
     """Viscous part of the tangential spring over its stiffness."""
     exact_turns: bool
     """Follow the tractrix where the direction turns; else project onto the cone (first order)."""
+    creep_mm_s: float = 0.0
+    """Speed at which a stuck tip creeps at its static limit; it falls by e for each `creep_share`
+    of the limit below it (Heslot et al. 1994, Phys. Rev. E 49, 4973; Ruina 1983)."""
+    creep_share: float = 0.05
+    least_mm_s: float = 0.0
+    """A tip that slides slower than this sticks: where friction falls with speed, no steady sliding
+    exists (Armstrong-Helouvry et al. 1994, Automatica 30, 1083)."""
+    curvature: float = 0.0
+    """Of the plate, 1/mm: convex towards the sensor, highest where x = y = 0."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +188,10 @@ def make_springs(
     static_excess: float = 0.0,
     strengthening: float = 0.0,
     weak_mm_s: float = 0.1,
+    creep_mm_s: float = 0.0,
+    creep_share: float = 0.05,
+    least_mm_s: float = 0.0,
+    curvature: float = 0.0,
     relaxation_share: float = 0.0,
     relaxation_s: float = 1.0,
     damping_s: float = 0.0,
@@ -210,6 +224,10 @@ def make_springs(
         relaxation_s=float(relaxation_s),
         damping_s=float(damping_s),
         exact_turns=exact_turns,
+        creep_mm_s=float(creep_mm_s) if rich else 0.0,
+        creep_share=float(creep_share),
+        least_mm_s=float(least_mm_s) if rich else 0.0,
+        curvature=float(curvature),
     )
     return Springs(table, friction_field(knots), law)
 

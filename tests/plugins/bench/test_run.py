@@ -65,6 +65,11 @@ def choices(found: BenchResult) -> dict[str, list[tuple[float, int, float | None
     }
 
 
+def test_worlds_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must be one of usual, creep, stick-slip"):
+        run.run_bench(["rate"], "small", 1, tmp_path, worlds="harder")
+
+
 def test_other_test_worlds_change_figures_and_no_choice(folder: Path) -> None:
     one, other = (run.run_bench(NAMES, "small", seed, folder) for seed in (1, 2))
     assert choices(one) == choices(other)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,6 +46,33 @@ def test_a_seed_draws_the_test_worlds_and_nothing_else() -> None:
     known = {drawn.rig.model_dump_json() for part in scenes.training_scenes(SIZE) for drawn in part}
     assert not known & {drawn.rig.model_dump_json() for drawn in (*one, *other)}
     assert [drawn.name for drawn in one] == [drawn.name for drawn in other]
+
+
+@pytest.mark.parametrize("worlds", ["creep", "stick-slip", "texture", "curved", "hard"])
+def test_harder_worlds_differ_in_the_keys_of_their_effects_alone(worlds: str) -> None:
+    usual, hard = (scenes.training_scenes(SIZE, it)[0] for it in ("usual", worlds))
+    keys = {key for effect in definition.WORLDS[worlds] for key in definition.EFFECTS[effect]}
+    for before, after in zip(usual, hard, strict=True):
+        assert (after.seed, after.depth_mm, after.speed_mm_s) == (
+            before.seed,
+            before.depth_mm,
+            before.speed_mm_s,
+        )
+        flat = [flattened(it.rig.model_dump()["mock"]) for it in (before, after)]
+        changed = {key for key in flat[1] if flat[0].get(key) != flat[1][key]}
+        assert changed <= keys
+        assert len(changed) >= len(keys) - 1  # a draw may be the value that it was
+
+
+def flattened(
+    settings: Mapping[str, Any], above: tuple[str, ...] = ()
+) -> dict[tuple[str, ...], Any]:
+    """Return the values of nested settings by their keys."""
+    found: dict[tuple[str, ...], Any] = {}
+    for key, value in settings.items():
+        inside = flattened(value, (*above, key)) if isinstance(value, dict) else None
+        found |= inside if inside is not None else {(*above, key): value}
+    return found
 
 
 def test_a_larger_set_begins_with_the_worlds_of_a_smaller_one() -> None:
