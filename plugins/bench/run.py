@@ -332,8 +332,8 @@ def run_bench(
         worlds: one of `WORLDS`.
 
     Raises:
-        InputError: there are no such worlds, there is no such detector, it breaks the rules of the bench, or `folder` is a
-            file.
+        InputError: there are no such worlds, there is no such detector, it breaks the rules of the
+            bench, or `folder` is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("--folder", "", str(folder), "must be a folder")
