@@ -25,7 +25,9 @@ Every millisecond:
    shares vary than by chance (Pearson's statistic per degree of freedom, McCullagh & Nelder 1989,
    section 4.5). The half of the places that differ most is left out: they may be the tips that
    slide. While an object brushes over single papillae, which shows by places with far more events
-   than before, the statistic is divided by `TOUCHED_SCALE` too.
+   than before for longer than `JUMP_MS`, the statistic is divided by `TOUCHED_SCALE` too. A tip
+   that jumps and sticks again causes as many, but for a few milliseconds: then its marker must
+   come back before the same pixels see it move, and its place is silent for so long.
 
 While most events of the places are OFF, the skin is unloaded, and the test is another: a place
 causes twice the events that its number of cells lets expect, and its share of ON events is `TURNED`
@@ -48,7 +50,7 @@ from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
-VERSION = 2
+VERSION = 3
 """Incremented when the evidence of the same events is another."""
 BIN_US = 1000
 CELLS_ACROSS = 80
@@ -77,6 +79,8 @@ LEAST = 12.0
 """Statistic below which nothing is evidence: a knock against the arm reaches up to this."""
 TOUCHED = 20.0
 """Statistic of a pushed place from which another object touches it; slides reach about 15."""
+JUMP_MS = 20
+"""Time for which a place is pushed while its tip jumps from stick to stick; objects push longer."""
 TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
 """An object that let go pulls the papillae's motion about for so long."""
 LARGEST = 30.0
@@ -140,7 +144,7 @@ class Papillae(Detector):
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._cells, self._unloaded = np.zeros(0), False
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
-        self._age = np.zeros(2, np.int64)
+        self._age = np.zeros(3, np.int64)
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
@@ -252,7 +256,9 @@ class Papillae(Detector):
         if len(self._rest) >= fewest:
             n = counts[-PLACES_MS:].sum(axis=0)
             w = counts[PLACES_MS:-GAP_MS].sum(axis=0)
-            n, w = n[w >= FEWEST_EVENTS], w[w >= FEWEST_EVENTS]
+            # a tip that jumps makes the shares of all others small
+            known = (w >= FEWEST_EVENTS) & (self._pushed < SUSPECTED)
+            n, w = n[known], w[known]
             if len(w) >= fewest and n.sum() > 0:
                 expected = n.sum() * w / w.sum()
                 squares = np.sort((n - expected) ** 2 / expected)
@@ -400,8 +406,9 @@ def _advance(
         counts: events of each place, in the memory, the gap and the milliseconds of `value`.
         noise: events a millisecond of each place.
         rest, pushed: statistics, which are changed. scale: square of the dispersion.
-        age: changed, shape (2,): milliseconds for which an object still counts as touching, and
-            since enough places move. In the first ones all cause more events than before.
+        age: changed, shape (3,): milliseconds for which an object still counts as touching, since
+            enough places move (in the first ones all cause more events than before), and for
+            which a place has been pushed.
         fewest: places that must move. value: of each millisecond.
     """
     places = len(rest)
@@ -414,7 +421,7 @@ def _advance(
         if moving.sum() < fewest or not others.any():
             rest[:] = 0.0
             pushed[:] = 0.0
-            age[1] = 0
+            age[1:] = 0
         else:
             all_n, all_w = n[others].sum(), memory[others].sum()
             weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
@@ -434,7 +441,8 @@ def _advance(
             age[1] += 1
             if age[1] < MEMORY_MS:
                 pushed[:] = 0.0
-            age[0] = TOUCHED_MS if pushed.max() >= TOUCHED else max(age[0] - 1, 0)
+            age[2] = age[2] + 1 if pushed.max() >= TOUCHED else 0
+            age[0] = TOUCHED_MS if age[2] > JUMP_MS else max(age[0] - 1, 0)
             most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if age[0] > 0 else 1.0))
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]

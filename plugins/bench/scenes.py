@@ -77,7 +77,7 @@ def training_scenes(size: Size, worlds: str = "usual") -> tuple[list[SceneDraw],
     return train, list(_part("validation", size.validation, DEFINITION.validation_seed, worlds))
 
 
-def test_scenes(size: Size, seed: int, worlds: str = "usual") -> list[SceneDraw]:
+def test_scenes(size: Size, seed: int, worlds: str) -> list[SceneDraw]:
     """Return test scenes in worlds that a seed draws."""
     return list(_part("test", size.test, hash_integer("bench test", VERSION, seed), worlds))
 

@@ -58,6 +58,9 @@ def choose_level(rig: RigFile, plan: Plan) -> LevelChoice | None:
     stated = scene_of(rig).scene.level
     if stated != "auto":
         return LevelChoice(int(stated[1]), "set by the rig file (mock.scene.level)")
+    friction = scene_of(rig).scene.friction
+    if friction.creep_mm_s > 0.0 or friction.least_mm_s > 0.0:
+        return LevelChoice(HIGHEST, "creep and stick-slip are in no lower level")
     slides = slides_of(plan)
     if not slides and plan.protocol.collection.plate is None:
         return LevelChoice(

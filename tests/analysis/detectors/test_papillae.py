@@ -31,14 +31,15 @@ def drawn(
     rates: Rates,
     noise_hz: float = 3000.0,
     on: Rates = lambda t: np.ones((len(t), len(CENTRES))),
+    peak: float = 4,
 ) -> EventChunk:
     """Draw Poisson events on the markers' edges, and noise all over the sensor.
 
     Args:
-        rates: of times, s, (n,): those of the markers, Hz, (n, 19), at most four times `RATE_HZ`.
+        rates: of times, s, (n,): those of the markers, Hz, (n, 19), at most `peak` times `RATE_HZ`.
         on: their shares of ON events, likewise; noise is half ON.
     """
-    most = 4 * RATE_HZ
+    most = peak * RATE_HZ
     parts = []
     for marker, (x, y) in enumerate(CENTRES):
         t = rng.uniform(0, END_S, rng.poisson(most * END_S))
@@ -83,6 +84,14 @@ def one_stops(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The last marker comes to rest."""
     rates = moving(t)
     rates[t > SLIP_S, -1] = 0.0
+    return rates
+
+
+def one_slips_and_sticks(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The last marker jumps back within 6 ms, and is still until it is loaded again."""
+    rates = moving(t)
+    rates[(t > SLIP_S) & (t < SLIP_S + 0.006), -1] *= 15
+    rates[(t > SLIP_S + 0.006) & (t < SLIP_S + 0.06), -1] = 0.0
     return rates
 
 
@@ -139,6 +148,14 @@ def test_a_marker_that_comes_to_rest_is_seen_at_once(
     slip_ms = round(1000 * SLIP_S)
     assert value[:slip_ms].max() < LEVEL
     assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
+    value = evidence(drawn(np.random.default_rng(seed), one_slips_and_sticks, peak=15))
+    slip_ms = round(1000 * SLIP_S)
+    assert value[:slip_ms].max() < LEVEL
+    assert (value[slip_ms : slip_ms + 40] > LEVEL).any()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_its_scenes_are_what_they_were() -> None:
 
 
 def test_a_seed_draws_the_test_worlds_and_nothing_else() -> None:
-    one, same, other = (scenes.test_scenes(SIZE, seed) for seed in (1, 1, 2))
+    one, same, other = (scenes.test_scenes(SIZE, seed, "usual") for seed in (1, 1, 2))
     assert one == same
     assert not {drawn.rig.model_dump_json() for drawn in one} & {
         drawn.rig.model_dump_json() for drawn in other
@@ -83,18 +83,18 @@ def test_a_larger_set_begins_with_the_worlds_of_a_smaller_one() -> None:
 
 @pytest.fixture(scope="module")
 def slides() -> list[Scene]:
-    return [scenes.simulated(drawn) for drawn in scenes.test_scenes(SIZE, 1)]
+    return [scenes.simulated(drawn) for drawn in scenes.test_scenes(SIZE, 1, "usual")]
 
 
 def test_a_scene_repeats_to_the_event(slides: list[Scene]) -> None:
-    again = scenes.simulated(scenes.test_scenes(SIZE, 1)[1])
+    again = scenes.simulated(scenes.test_scenes(SIZE, 1, "usual")[1])
     for name in ("x", "y", "p", "t_us"):
         assert np.array_equal(getattr(again.events, name), getattr(slides[1].events, name))
     assert again.slip == slides[1].slip
 
 
 def test_a_tip_slips_in_the_motion_and_its_marker_moves_later(slides: list[Scene]) -> None:
-    for drawn, scene in zip(scenes.test_scenes(SIZE, 1), slides, strict=True):
+    for drawn, scene in zip(scenes.test_scenes(SIZE, 1, "usual"), slides, strict=True):
         slip = scene.slip
         assert drawn.hold_s * 1e6 < slip.physical_us < slip.paper_us < slip.gross_us
         assert slip.gross_us <= scene.end_us
@@ -104,7 +104,7 @@ def test_a_tip_slips_in_the_motion_and_its_marker_moves_later(slides: list[Scene
 
 
 def test_events_rise_when_the_arm_moves_and_not_before(slides: list[Scene]) -> None:
-    for drawn, scene in zip(scenes.test_scenes(SIZE, 1), slides, strict=True):
+    for drawn, scene in zip(scenes.test_scenes(SIZE, 1, "usual"), slides, strict=True):
         moved_us = round(drawn.hold_s * 1e6)
         edges = np.searchsorted(
             scene.events.t_us, moved_us + np.array([-200_000, 0, 50_000, 250_000])

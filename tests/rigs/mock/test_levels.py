@@ -69,6 +69,16 @@ def test_a_rough_scene_hides_even_large_deflection(rig: RigFile) -> None:
     assert choose_level(rough, plan_of("pilot")).level == 1
 
 
+@pytest.mark.parametrize("friction", [{"creep_mm_s": 0.1}, {"least_mm_s": 1.0}])
+def test_what_no_lower_level_has_is_not_left_out(rig: RigFile, friction: dict) -> None:
+    rough = changed(
+        rig,
+        skin={"relaxation_share": 0.0, "base_normal_n_per_m": 40.0},
+        friction={"static_excess": 0.0, "path_variation": 0.3, **friction},
+    )
+    assert choose_level(rough, plan_of("pilot")).level == 3
+
+
 def test_what_the_rig_file_says_is_done(rig: RigFile) -> None:
     stated = changed(rig, level="L1")
     choice = choose_level(stated, plan_of("pilot"))

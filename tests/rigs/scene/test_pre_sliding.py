@@ -117,6 +117,6 @@ def test_a_tip_that_is_driven_faster_than_the_least_speed_slides_steadily() -> N
 def test_a_curved_plate_presses_each_tip_by_its_place() -> None:
     flat, curved = linear(), linear(curvature=1 / 500)
     (_, even), (_, load) = (run(it, pressed(it), at(2.0, 1.0, 2.8)) for it in (flat, curved))
-    away = flat.layout + [2.0, 1.0]
+    away = flat.layout + np.array([2.0, 1.0])
     sag_mm = 0.5 * (away**2).sum(axis=1) / 500
     assert even[0, :, 2] - load[0, :, 2] == pytest.approx(flat.normal * sag_mm, rel=1e-9)
