@@ -21,13 +21,14 @@ Every millisecond:
    that may be at rest, or that cause twice the events, do not count as the others. A millisecond
    with more events than usual says no more than a usual one: events of a knock come in bursts that
    are not independent.
-4. **Dispersion**: the test's statistic is divided by the square of how much more the other places'
-   shares vary than by chance (Pearson's statistic per degree of freedom, McCullagh & Nelder 1989,
-   section 4.5). The half of the places that differ most is left out: they may be the tips that
-   slide. While an object brushes over single papillae, which shows by places with far more events
-   than before for longer than `JUMP_MS`, the statistic is divided by `TOUCHED_SCALE` too. A tip
-   that jumps and sticks again causes as many, but for a few milliseconds: then its marker must
-   come back before the same pixels see it move, and its place is silent for so long.
+4. **Dispersion**: a millisecond's log likelihood ratio is divided by the square of how much more
+   the other places' shares vary than by chance (Pearson's statistic per degree of freedom,
+   McCullagh & Nelder 1989, section 4.5): what was doubtful when it came stays so. The half of the
+   places that differ most is left out: they may be the tips that slide. While an object brushes
+   over single papillae, which shows by places with far more events than before for longer than
+   `JUMP_MS`, it is divided by `TOUCHED_SCALE` too. A tip that jumps and sticks again causes as
+   many, but for a few milliseconds: then its marker must come back before the same pixels see it
+   move, and its place is silent for so long.
 
 While most events of the places are OFF, the skin is unloaded, and the test is another: a place
 causes twice the events that its number of cells lets expect, and its share of ON events is `TURNED`
@@ -425,6 +426,7 @@ def _advance(
         else:
             all_n, all_w = n[others].sum(), memory[others].sum()
             weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
+            doubt = scale * (TOUCHED_SCALE if age[0] > 0 else 1.0)
             for j in range(places):
                 if not moving[j]:
                     rest[j] = pushed[j] = 0.0
@@ -435,15 +437,17 @@ def _advance(
                 share = min(w / (all_w + alone * w), MOST)
                 silent = min(AT_REST + (1 - AT_REST) * noise[j] * MEMORY_MS / w, MOST)
                 seen, all_seen = weight * n[j], weight * total
-                rest[j] = _page(rest[j], silent, seen, all_seen, share)
-                moved = _page(pushed[j], DISTURBED, seen, all_seen, min(share, MOST / DISTURBED))
-                pushed[j] = min(moved, LARGEST)
+                ratio = _log_ratio(silent * share, share, seen, all_seen)
+                rest[j] = max(rest[j] + ratio / doubt, 0.0)
+                share = min(share, MOST / DISTURBED)
+                ratio = _log_ratio(DISTURBED * share, share, seen, all_seen)
+                pushed[j] = min(max(pushed[j] + ratio, 0.0), LARGEST)
             age[1] += 1
             if age[1] < MEMORY_MS:
                 pushed[:] = 0.0
             age[2] = age[2] + 1 if pushed.max() >= TOUCHED else 0
             age[0] = TOUCHED_MS if age[2] > JUMP_MS else max(age[0] - 1, 0)
-            most = np.sort(rest)[-2:].sum() / (scale * (TOUCHED_SCALE if age[0] > 0 else 1.0))
+            most = np.sort(rest)[-2:].sum()
             value[k] = most if most >= LEAST else 0.0
         memory -= counts[k]
 
@@ -508,10 +512,3 @@ def _advance_unloaded(
 def _log_ratio(share: float, other: float, n: float, total: float) -> float:
     """Return the log of the ratio of two shares' likelihoods, by binomial counts."""
     return n * math.log(share / other) + (total - n) * math.log((1 - share) / (1 - other))
-
-
-@njit(cache=True, nogil=True)
-def _page(statistic: float, ratio: float, n: float, total: float, share: float) -> float:
-    """Advance Page's test of `ratio` times a share, against the share, by binomial counts."""
-    silent = math.log((1 - ratio * share) / (1 - share))
-    return max(statistic + n * math.log(ratio) + (total - n) * silent, 0.0)

@@ -9,7 +9,14 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import binom, chi2
 
-from sliplab.analysis.detectors.papillae import REMAINING_MEAN, Papillae, _log_ratio, _page
+from sliplab.analysis.detectors.papillae import (
+    GAP_MS,
+    MEMORY_MS,
+    REMAINING_MEAN,
+    Papillae,
+    _advance,
+    _log_ratio,
+)
 from sliplab.storage.streams import EventChunk
 
 WIDTH, HEIGHT = 640, 480
@@ -134,6 +141,14 @@ def held_back(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return rates
 
 
+def most_let_go(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Twelve markers come to rest within 60 ms, as when a sensor twists."""
+    rates = moving(t)
+    for marker in range(12):
+        rates[t > SLIP_S + 0.005 * marker, marker] = 0.0
+    return rates
+
+
 def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Noise alone."""
     return np.zeros((len(t), len(CENTRES)))
@@ -148,6 +163,14 @@ def test_a_marker_that_comes_to_rest_is_seen_at_once(
     slip_ms = round(1000 * SLIP_S)
     assert value[:slip_ms].max() < LEVEL
     assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_tips_that_let_go_at_once_do_not_hide_each_other(seed: int) -> None:
+    value = evidence(drawn(np.random.default_rng(seed), most_let_go))
+    slip_ms = round(1000 * SLIP_S)
+    assert value[:slip_ms].max() < LEVEL
+    assert (value[slip_ms : slip_ms + 20] > LEVEL).any()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -263,14 +286,31 @@ def test_a_scene_leaves_nothing_to_the_next() -> None:
     assert np.array_equal(found[1], evidence(second))
 
 
+def test_what_was_doubtful_when_it_came_stays_so() -> None:
+    # the last of 12 places is silent for 40 ms, first while shares vary tenfold, then by chance
+    counts = np.full((MEMORY_MS + GAP_MS + 40, 12), 4)
+    counts[-40:, -1] = 0
+    found = {}
+    for scale in (100.0, 1.0):
+        rest, value = np.zeros(12), np.zeros(40)
+        zero, age = np.zeros(12), np.zeros(3, np.int64)
+        _advance(counts, zero, rest, zero.copy(), age, scale, 10, value)
+        found[scale] = rest[-1], value.max()
+    assert found[1.0][1] > LEVEL > 0.0 == found[100.0][1]
+    assert found[100.0][0] == pytest.approx(found[1.0][0] / 100.0)
+    # all go on, and shares vary by chance again
+    calm, value = np.full((MEMORY_MS + GAP_MS + 20, 12), 4), np.zeros(20)
+    rest = np.zeros(12)
+    rest[-1] = found[100.0][0]
+    _advance(calm, zero, rest, zero.copy(), age, 1.0, 10, value)
+    assert value.max() == 0.0
+
+
 def test_a_step_of_pages_test_is_the_ratio_of_binomial_likelihoods() -> None:
     total, share, ratio = 40.0, 0.1, 0.25
     for n in (0.0, 3.0, 9.0):
         expected = binom.logpmf(n, total, ratio * share) - binom.logpmf(n, total, share)
-        after = _page(50.0, ratio, n, total, share)  # so far from 0 that nothing is cut off
-        assert after - 50.0 == pytest.approx(expected, rel=1e-12)
         assert _log_ratio(ratio * share, share, n, total) == pytest.approx(expected, rel=1e-12)
-    assert _page(0.0, ratio, 9.0, total, share) == 0.0
 
 
 def test_the_mean_of_the_remaining_squares_is_that_of_normal_deviates() -> None:

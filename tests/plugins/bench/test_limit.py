@@ -58,7 +58,7 @@ def test_without_its_slip_a_tip_is_dragged_on() -> None:
 
 
 def test_of_a_slide_it_is_milliseconds_and_repeats() -> None:
-    drawn = scenes_of(SIZES["small"], 5)[:3]
+    drawn = scenes_of(SIZES["small"], 5, "usual")[:3]
     waits = [waits_ms(slide, [1.0, 100.0]) for slide in drawn]
     assert all(2.0 <= late[1] <= late[0] <= 60.0 for late in waits)
     assert waits_ms(drawn[0], [1.0, 100.0]) == waits[0]

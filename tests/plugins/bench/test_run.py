@@ -169,7 +169,7 @@ def test_the_command_prints_what_it_writes(folder: Path) -> None:
         text in page for text in ("simulated", "over 2 test worlds", "<svg", "decision (us)")
     )
     shown = here(*words)
-    assert "bench 2, small, seed 1 (simulated)" in shown.stdout
+    assert "bench 2, small, seed 1, usual worlds (simulated)" in shown.stdout
     said = " ".join(shown.stderr.split())
     assert "over 2 test worlds and 8 with nuisances; below 24 trials or worlds, here 2" in said
     for row in data["detectors"]:
