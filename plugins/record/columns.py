@@ -30,7 +30,8 @@ from sliplab.protocols.timing import StreamGrade
 from sliplab.protocols.yaml_file import rule
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.device_settings import DriverSettings
-from sliplab.rigs.core.driver import SensorDriver
+from sliplab.rigs.core.driver import SensorDriver, lazy
+from sliplab.rigs.core.network import serial_port
 from sliplab.rigs.core.stream_buffer import StreamBuffer
 from sliplab.storage.streams import Chunk, Json
 
@@ -38,7 +39,7 @@ DEVICE = "columns"
 OPEN_S, WAIT_S = 5.0, 0.2
 _MOST_LINE = 1 << 16
 """Bytes without an end of line that are no lines."""
-_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
 class ColumnsSettings(DriverSettings):
@@ -163,7 +164,7 @@ class ColumnsSensor:
         host = np.full(len(values), host_ns)
         t_ns = host
         if settings.time_column is not None:
-            t_ns = np.rint(by_name[settings.time_column] * _UNITS[settings.time_unit])
+            t_ns = np.rint(by_name[settings.time_column] * UNITS[settings.time_unit])
             t_ns = t_ns.astype(np.int64)
         part = {"t": t_ns, "host": host, **{name: by_name[name] for name in settings.stored}}
         self.received += len(values)
@@ -233,6 +234,8 @@ def grade(settings: ColumnsSettings) -> StreamGrade:
 
 def why_unreachable(settings: ColumnsSettings) -> str | None:
     """Return why a port or socket cannot be opened; None if it can."""
+    if "://" not in settings.place:
+        return serial_port(settings.place)
     try:
         _, close = _open(settings)
     except (OSError, ValueError) as error:
@@ -251,4 +254,6 @@ DRIVER = SensorDriver(
     build=ColumnsSensor,
     stream=table_kind({"value": ""}),
     grade=grade,
+    fake=lazy("sliplab.plugins.record.columns_fake:FakeColumns"),
+    reach=lambda settings, address: settings.model_copy(update={"place": address}),
 )
