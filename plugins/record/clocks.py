@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,15 @@ from sliplab.analysis.clocks.synchronise import (
     streams_of,
     synchronise,
 )
-from sliplab.plugins.record.sources import CLOCK_STREAM, FIRST_CAMERAS, HOST, READS, SourceAbout
+from sliplab.plugins.record.sources import (
+    CLOCK_STREAM,
+    FIRST_CAMERAS,
+    HOST,
+    READS,
+    SHARED,
+    TIMING,
+    SourceAbout,
+)
 from sliplab.plugins.record.table import CLOCK
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
@@ -59,12 +68,12 @@ def fit_clocks(
     by_timing = {
         name: each.record
         for name, each in timed.items()
-        if each.clock != READS and name not in FIRST_CAMERAS
+        if each.clock == TIMING and name not in FIRST_CAMERAS
     }
     inputs, errors = clocks_in(folder, by_timing), {}
     with StreamReader(folder / DATA) as reader:
         for name, source in timed.items():
-            if source.clock == READS:
+            if source.clock != TIMING:
                 timing = source.record.timing or StreamTiming()
                 how = timing.model_copy(update={"grade": "device time stamps"})
                 reads, errors[name] = _reads(reader, name)
@@ -82,8 +91,12 @@ def fit_clocks(
             result.refused[name] = fitted.refused[name]
             continue
         record, error = fitted.devices[name].record(), errors.get(name, 0)
-        bound = (record.uncertainty_ns or 0.0) + error
-        result.found[name] = record.model_copy(update={"uncertainty_ns": bound})
+        source = timed[name]
+        changed: dict[str, Any] = {"uncertainty_ns": (record.uncertainty_ns or 0.0) + error}
+        if source.clock in SHARED:
+            changed["grade"] = source.clock
+            changed["uncertainty_ns"] += source.uncertainty_ns or 0.0
+        result.found[name] = record.model_copy(update=changed)
     return result
 
 
@@ -94,6 +107,7 @@ def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:
     """
     group = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}"
     t_ns, before, after, error = (reader.column(f"{group}/{part}") for part in CLOCK.columns)
-    some = slice(None, None, max(1, len(t_ns) // 4000))
+    # an odd step: of a shared clock every other reading is an arrival
+    some = slice(None, None, max(1, len(t_ns) // 4000) | 1)
     reads = ClockReads(t_ns[some], (before - error)[some], (after + error)[some])
     return reads, int(error.max(initial=0))

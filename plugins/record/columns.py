@@ -59,6 +59,11 @@ class ColumnsSettings(DriverSettings):
     time_column: str | None = None
     """Column with the device's time; without it rows are timed by their arrival."""
     time_unit: Literal["s", "ms", "us", "ns"] = "ms"
+    shared_clock: Literal["ptp", "utc"] | None = None
+    """Clock of the time column where the host has it too: TAI by PTP, or UTC. `sliplab record`
+    uses it; a rig times such rows by their arrival."""
+    uncertainty_ms: float | None = Field(default=None, gt=0, le=1000)
+    """Bound of the error of a shared clock's times, of device and host together, milliseconds."""
     start: str = ""
     """Text that is sent when the connection opens, such as `START\\n`."""
     stall_s: float = Field(default=5.0, ge=0.1, le=3600)
@@ -70,6 +75,13 @@ class ColumnsSettings(DriverSettings):
         return {
             name: unit for name, unit in self.columns.items() if name not in {"-", self.time_column}
         }
+
+    @rule
+    def _clock_is_stated(self) -> ColumnsSettings:
+        if self.shared_clock is not None and None in (self.time_column, self.uncertainty_ms):
+            text = "needs time_column and uncertainty_ms"
+            raise KeyedError(".shared_clock", self.shared_clock, text)
+        return self
 
     @rule
     def _columns_fit(self) -> ColumnsSettings:
