@@ -176,9 +176,7 @@ def map_by_taps(
             f"{plural(i.size, 'tap')} contradict each other for clocks that differ by at most "
             f"{max_drift_ppm:g} ppm: one is not the same in both, or a clock jumped",
         )
-    return TapMap(
-        i.size, int(at[0]), int(at[-1]), origin, (drift[fits], below[fits], above[fits])
-    )
+    return TapMap(i.size, int(at[0]), int(at[-1]), origin, (drift[fits], below[fits], above[fits]))
 
 
 def _pairs(a: Taps, b: Taps, near: tuple[int, int] | None) -> tuple[Ints, Ints]:

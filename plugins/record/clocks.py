@@ -23,7 +23,6 @@ from sliplab.plugins.record.sources import (
     CLOCK_STREAM,
     FIRST_CAMERAS,
     HOST,
-    READS,
     SHARED,
     TIMING,
     SourceAbout,
