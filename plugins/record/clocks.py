@@ -6,13 +6,14 @@ The host's clock takes the place of the sync box, so the maps are fitted as thos
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.analysis.clocks.synchronise import (
     ClockInput,
     clocks_in,
@@ -28,6 +29,7 @@ from sliplab.plugins.record.sources import (
     SourceAbout,
 )
 from sliplab.plugins.record.table import CLOCK
+from sliplab.plugins.record.tapped import clock_by_taps
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema.trial import DeviceRecord
@@ -39,21 +41,39 @@ from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 
 @dataclass(frozen=True)
 class Clocks:
-    """Maps onto the host's clock by stream, and why others have none."""
+    """Maps onto the host's clock by stream, why others have none, and why there is none by taps."""
 
     found: dict[str, DeviceRecord] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
+    tap: str = ""
 
 
 def fit_clocks(
-    folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]
+    folder: Path,
+    sources: Mapping[str, SourceAbout],
+    span_ns: tuple[int, int],
+    tap: tuple[str, str] | None = None,
+    taps_ns: Sequence[int] = (),
 ) -> Clocks:
     """Fit the clocks of a sealed trial.
 
     Args:
         sources: streams that have rows.
         span_ns: begin and end of the trial on the host's clock.
+        tap, taps_ns: see `plugins.record.tapped`.
     """
+    result = _fitted(folder, sources, span_ns)
+    if tap is None or not result.found.keys() >= set(tap):
+        return result
+    with StreamReader(folder / DATA) as reader:
+        try:
+            found = clock_by_taps(reader, tap, sources[tap[0]], result.found, taps_ns)
+            return replace(result, found={**result.found, tap[0]: found})
+        except (NoMatchError, ValueError) as error:
+            return replace(result, tap=str(error))
+
+
+def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]) -> Clocks:
     result = Clocks()
     timed = {}
     for name, source in sources.items():

@@ -145,7 +145,12 @@ class Source:
             last: stop, and read what was sent before.
         """
         seen = _Newest(sink, self)
+        pushed = self.device if isinstance(self.device, PushedStream) else None
+        if last and pushed is not None:
+            pushed.stop()  # nothing comes between the last read and the end
         self.stream.drain(seen)
+        while last and pushed is not None and pushed.waiting:
+            self.stream.drain(seen)
         if last:
             self.stream.finish(seen)
         now = time.monotonic_ns()
