@@ -81,6 +81,9 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="one line of JSON on standard output")
     parser.add_argument("--keep", action="store_true", help="its figures go into RESULTS.md")
     parser.add_argument("--v2e", metavar="FOLDER", help="v2e's source, for `scene`")
+    parser.add_argument(
+        "--size", action="append", default=[], metavar="NAME=N", help="of NAME, as seconds=3600"
+    )
     wanted = parser.parse_args()
     if wanted.v2e:
         from benchmarks.emulator import SOURCE
@@ -90,7 +93,8 @@ def main() -> int:
         if wanted.json:
             parser.error("--json goes with a NAME")
         return run_all()
-    found = result(wanted.name)
+    sizes = dict(size.split("=", 1) for size in wanted.size)
+    found = result(wanted.name, **{name: int(value) for name, value in sizes.items()})
     if wanted.keep:
         keep(found, NAMES)
     if wanted.json:

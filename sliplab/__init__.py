@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     )
     from sliplab.flows.collecting.requests import CampaignStopped
     from sliplab.plugins.align.align import Alignment, AlignmentRefused, align
+    from sliplab.plugins.align.taps import align_taps
     from sliplab.plugins.record.recorder import record
     from sliplab.plugins.record.sources import columns, lsl, push, usb_camera
     from sliplab.protocols.errors import InputError
@@ -70,6 +71,7 @@ __all__ = [
     "WindowCounts",
     "__version__",
     "align",
+    "align_taps",
     "check",
     "collect",
     "columns",
@@ -99,6 +101,7 @@ _ELSEWHERE = {
     "Plan": "sliplab.protocols.plan",
     "StoreError": "sliplab.storage.errors",
     "align": "sliplab.plugins.align.align",
+    "align_taps": "sliplab.plugins.align.taps",
 }
 
 

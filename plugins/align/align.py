@@ -57,6 +57,8 @@ _EXPECTED = 0.1
 """Share of events taken to be spurious or late."""
 _UNCONFIRMED = 3
 """Events at the lists' ends that could lie behind a jump unseen."""
+_LONG_NS = 1e12
+"""Events so far apart rather have another unit."""
 UNKNOWN = -(2**63)
 
 
@@ -316,14 +318,16 @@ class _Fit:
             else:
                 by, runs = "pattern", self._by_pattern()
         except NoMatchError as error:
-            raise AlignmentRefused(error.reason, f"{error}{self._hints(error.reason)}") from None
+            text = self._explained(error.reason, str(error))
+            raise AlignmentRefused(error.reason, text) from None
         least = MIN_EVENTS if by == "pattern" else MIN_KNOWN
         parts = [
             part for piece, run in self._merged(runs) for part in self._split(piece, run, least)
         ]
         steep = [part for part in parts if abs(part.state.rate) > self.max_drift]
         if steep or not parts:
-            raise AlignmentRefused("no_match", self._no_clock(steep, by) + self._hints("no_match"))
+            text = self._explained("no_match", self._no_clock(steep, by))
+            raise AlignmentRefused("no_match", text)
         return self._finished(parts, by)
 
     def _no_clock(self, steep: list[_Part], by: str) -> str:
@@ -341,17 +345,22 @@ class _Fit:
             "allowed: raise it, or check that both saw the same events"
         )
 
-    def _hints(self, reason: str) -> str:
-        """Return further likely causes of a refusal."""
+    def _explained(self, reason: str, text: str) -> str:
+        """Return a refusal with further likely causes; a wrong unit explains all others."""
+        units = []
+        steps = [float(np.median(np.abs(np.diff(events.ns)))) for events in (self.a, self.b)]
+        power = 3 * round(float(np.log10(steps[0] / steps[1])) / 3) if min(steps) > 0 else 0
+        if power and 0.5 < steps[0] / steps[1] / 10.0**power < 2:
+            units.append(f"intervals of A are about 1e{power} times those of B: check the units")
+        for events, step in zip((self.a, self.b), steps, strict=True):
+            if events.column and step > _LONG_NS:
+                column = f"{events.name}, {events.column}"
+                units.append(f"{column}: events come {step / 1e9:.3g} s apart: is the unit right?")
         found = ["or give an approximate offset"] if reason == "ambiguous" else []
         for events, pieces in ((self.a, self.pieces_a), (self.b, self.pieces_b)):
             if len(pieces) > 2:
                 found.append(str(_not_in_order(events, pieces)))
-        steps = [float(np.median(np.abs(np.diff(events.ns)))) for events in (self.a, self.b)]
-        power = 3 * round(float(np.log10(steps[0] / steps[1])) / 3) if min(steps) > 0 else 0
-        if power and 0.5 < steps[0] / steps[1] / 10.0**power < 2:
-            found.append(f"intervals of A are about 1e{power} times those of B: check the units")
-        return "".join(f"; {hint}" for hint in found)
+        return "; ".join([*units, text, *found])
 
     def _by_ids(self, ids_a: Ints, ids_b: Ints) -> list[tuple[int, Run]]:
         once_a, once_b = _unique(ids_a), _unique(ids_b)

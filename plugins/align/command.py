@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,7 +11,12 @@ from sliplab.flows.cli.common import DATA, JsonOption, finish
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
 
+if TYPE_CHECKING:
+    from sliplab.plugins.align.align import Alignment
+    from sliplab.plugins.align.taps import TapAlignment
+
 app = typer.Typer()
+_WRITTEN = ("written", "times", "unknown", "beyond_events")
 
 
 @app.command(
@@ -55,6 +60,10 @@ def align_(
         bool,
         typer.Option("--harp", help="Edges (time, state) of a Harp clock's 1 kbaud output."),
     ] = False,
+    taps: Annotated[
+        bool,
+        typer.Option("--taps", help="Signals (time, values) that show the same sharp taps."),
+    ] = False,
     times: Annotated[
         Path | None, typer.Option("--map", help="CSV of times on A to map; default: A's events.")
     ] = None,
@@ -70,45 +79,71 @@ def align_(
     """
     from sliplab.plugins.align.align import WITHIN_S, AlignmentRefused, align
     from sliplab.plugins.align.events import events_from
+    from sliplab.plugins.align.taps import align_taps
     from sliplab.protocols.adapter_parts import TIME_UNITS
 
     if unit is not None and unit not in TIME_UNITS:
         raise InputError("--unit", "", unit, "must be one of s, ms, us, ns")
     if within is not None and offset is None:
         raise InputError("--within", "", within, "needs --offset, which it bounds")
+    if taps and out is not None and times is None:
+        raise InputError("--out", "", str(out), "needs --map, the times to map")
     if times is not None and out is None:
         raise InputError("--map", "", str(times), "needs --out, the file to write")
+    if taps and (harp or b == "harp"):
+        raise InputError("--taps", "", True, "goes without --harp")
     if out is not None and not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")
     for given in (a, b, times):
         if out is not None and given is not None and Path(out).resolve() == Path(given).resolve():
             raise InputError("--out", "", str(out), "is read, too; name another file")
-    first = events_from(a, "a", unit, harp=harp)
-    second = b if b == "harp" else events_from(b, "b", unit, harp=harp)
+    if out is not None and out.exists():
+        raise InputError("--out", "", str(out), "exists already and is not overwritten")
+    limits: dict[str, Any] = {
+        "offset_s": offset,
+        "within_s": WITHIN_S if within is None else within,
+        "max_drift_ppm": drift,
+    }
+    first = None if taps else events_from(a, "a", unit, harp=harp)
+    second = b if taps or b == "harp" else events_from(b, "b", unit, harp=harp)
     try:
-        found = align(
-            first,
-            second,
-            offset_s=offset,
-            within_s=WITHIN_S if within is None else within,
-            max_drift_ppm=drift,
-        )
+        found: Alignment | TapAlignment
+        if first is None:
+            found = align_taps(a, b, unit=unit, **limits)
+        else:
+            found = align(first, second, **limits)
     except AlignmentRefused as refusal:
         if as_json:
             console.print_json({"refused": refusal.reason, "message": str(refusal)})
         console.say(f"refused: {refusal.reason}: {refusal}")
         raise typer.Exit(exit_codes.FAILED) from None
-    columns = {"a": first.column, "b": second if isinstance(second, str) else second.column}
-    result = {"columns": columns, **found.to_json()}
+    result = found.to_json()
+    if first is not None:
+        column = second if isinstance(second, str) else second.column
+        result = {"columns": {"a": first.column, "b": column}, **result}
     if out is not None:
-        asked = (first if times is None else events_from(times, "times", unit)).ns
+        listed = first if times is None else events_from(times, "times", unit)
+        assert listed is not None  # with --taps times are given
+        asked = listed.ns
         mapped = found.map(asked)
         mapped.write(asked, out)
-        result |= {"written": str(out), "times": asked.size, "unknown": int((~mapped.known).sum())}
+        beyond = int((mapped.known & ~mapped.within).sum())
+        result |= {"written": str(out), "times": asked.size}
+        result |= {"unknown": int((~mapped.known).sum()), "beyond_events": beyond}
     finish(result if as_json else _pairs(result), f"{a} to {b}", as_json)
 
 
 def _pairs(result: dict[str, Any]) -> dict[str, Any]:
+    written = {key: result[key] for key in _WRITTEN if key in result}
+    if "taps" in result:
+        least, most = result["drift_ppm"]
+        return {
+            "taps": result["taps"],
+            "offset": f"B = A + {result['offset_ns'] / 1e9:.9f} s ± {result['half_ns'] / 1e3:.1f} "
+            f"us at A = {result['first_ns'] / 1e9:.3f} s",
+            "rate": f"{least:+.1f} to {most:+.1f} ppm",
+            **written,
+        }
     shown: dict[str, Any] = {
         "paired by": result["paired_by"],
         "columns": " and ".join(result["columns"].values()),
@@ -126,5 +161,4 @@ def _pairs(result: dict[str, Any]) -> dict[str, Any]:
             f"{jump['size_ns'] / 1e9:+.6f} s between A = {jump['after_ns'] / 1e9:.3f} and "
             f"{jump['before_ns'] / 1e9:.3f} s"
         )
-    shown |= {key: result[key] for key in ("written", "times", "unknown") if key in result}
-    return shown
+    return shown | written

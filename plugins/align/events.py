@@ -24,6 +24,7 @@ from sliplab.storage.formats.tables import (
 )
 
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 _TIMES = ("t", "time", "times", "timestamp", "timestamps", "onset")
 _IDS = ("id", "code", "barcode")
@@ -122,7 +123,22 @@ def _ns_of(times: ArrayLike, name: str, unit: str | None) -> Ints:
     return array.astype(np.int64) * TIME_UNITS[unit or "ns"]
 
 
-def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
+def signal_of_csv(path: Path, unit: str | None) -> tuple[Ints, Floats]:
+    """Return a file's times (n,), ns, and its other columns (n, columns). Raises InputError."""
+    columns, rows, time, unit = _rows(path, unit)
+    others = [column for column in columns if column != time]
+    if not others:
+        raise InputError(path, "heading", time, "needs a column of values beside that of times")
+    for row in rows:
+        for column in others:
+            if not _is_number(row.values.get(column, "")):
+                raise row.error(column, "must be a number")
+    values = [[float(row.values[column]) for column in others] for row in rows]
+    return np.array([_time_ns(row, time, unit) for row in rows]), np.array(values)
+
+
+def _rows(path: Path, unit: str | None) -> tuple[list[str], list[TableRow], str, str]:
+    """Return a file's columns and rows, and that of times with its unit."""
     name = str(path)
     lines = _text(path).splitlines()
     # a comment keeps its line, so that rows are counted as an editor counts them
@@ -133,7 +149,12 @@ def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
     time, named = _time_column(name, columns)
     if not rows:
         raise InputError(name, "", None, f"is empty below its heading {', '.join(columns)}")
-    unit = unit or named or "s"
+    return columns, rows, time, unit or named or "s"
+
+
+def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
+    name = str(path)
+    columns, rows, time, unit = _rows(path, unit)
     levels = _column(columns, _LEVELS)
     if harp and levels is None:
         raise InputError(name, "", None, f"needs a column {' or '.join(_LEVELS)} of edges")

@@ -34,7 +34,7 @@ def driver(
         str,
         typer.Option(
             "--kind",
-            help="Kinds of device, with commas: arm, events, frames, sync, force, gripper.",
+            help="Kinds of device, with commas: arm, events, frames, sync, force, gripper, scalar.",
         ),
     ] = "arm",
     into: Annotated[

@@ -27,7 +27,12 @@ from sliplab.plugins.driver_kit.bench import settle
 from sliplab.plugins.driver_kit.camera_benches import EventBench, FrameBench
 from sliplab.plugins.driver_kit.gripper_bench import GripperBench
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, Rules, RuleViolation
-from sliplab.plugins.driver_kit.sensor_benches import ArmForceBench, ForceBench, SyncBench
+from sliplab.plugins.driver_kit.sensor_benches import (
+    ArmForceBench,
+    ForceBench,
+    SensorBench,
+    SyncBench,
+)
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.driver import (
@@ -37,6 +42,7 @@ from sliplab.rigs.core.driver import (
     ForceSensorDriver,
     FrameCameraDriver,
     GripperDriver,
+    SensorDriver,
     SyncBoxDriver,
 )
 
@@ -104,6 +110,8 @@ def cases(
         return of(lambda: SyncBench(driver, settings, limits), common, sync_rules.RULES)
     if isinstance(driver, GripperDriver):
         return of(lambda: GripperBench(driver, settings, limits), gripper_rules.RULES)
+    if isinstance(driver, SensorDriver):
+        return of(lambda: SensorBench(driver, settings, limits), common, stream_rules.HOST_RULES)
     if not isinstance(driver, ForceSensorDriver):
         raise TypeError(f"{driver.name}: there are no rules for a {driver.kind}")
     rules = common, stream_rules.CLOCK_RULES, stream_rules.HOST_RULES, stream_rules.FORCE_RULES

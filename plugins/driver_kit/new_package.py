@@ -20,8 +20,10 @@ KINDS = {
     "sync": "sync_box",
     "force": "force_sensor",
     "gripper": "gripper",
+    "scalar": "",
 }
-"""Key of the device in a rig file, by the example that a new driver starts from."""
+"""Key of the device in a rig file, by the example that a new driver starts from; that of a scalar
+sensor is the name of its stream."""
 _EXAMPLES = "sliplab.plugins.driver_kit.examples"
 _OWN_IMPORT = r"^from {package}\S* import (?:\([^)]*\)|[^\n(]*)\n"
 
@@ -56,7 +58,6 @@ A driver for SlipLab. It runs unchanged, on a fake of a device that does not exi
 pip install -e .[dev]
 pytest                       # the rules that SlipLab holds a driver of this kind to
 sliplab rigs --drivers       # lists $title
-sliplab rigs rig.yaml        # reads the rig file that uses it
 ```
 
 | file | change it to |
@@ -65,12 +66,23 @@ sliplab rigs rig.yaml        # reads the rig file that uses it
 | `$name/driver.py` | how your device is spoken to: its protocol, or its maker's library |
 | `$name/fake.py` | what your device answers, so that all of it is tested without one |
 
-`rig.yaml` is a loopback rig with its fake; the rig file of a real rig has the same section of
-`devices:`, with the settings of your device.
+$files
 
 Write down here what was never tried on the device itself.
 """)
 
+_FILES = {
+    "rig.yaml": """\
+`rig.yaml` is a loopback rig with its fake (`sliplab rigs rig.yaml` reads it); the rig file of a
+real rig has the same section of `devices:`, with the settings of your device.""",
+    "streams.yaml": """\
+`sliplab record streams.yaml --store data --campaign NAME` records it; a rig file has the same
+section of `streams:`.""",
+}
+STREAMS = Template("""\
+streams:
+$streams
+""")
 RIG = Template("""\
 # The loopback rig with $title:
 # on fakes, so all that it stores is simulated.
@@ -79,6 +91,7 @@ name: $project-loopback
 devices:
 $devices
 $more""")
+_TEXTS = {"rig.yaml": RIG, "streams.yaml": STREAMS}
 _IN_RIG = {
     "arm": (
         ", host: 127.0.0.1, limits: {frame: plate, low_mm: [-20, -20, -70],\n"
@@ -142,7 +155,10 @@ def package_files(name: str, kinds: Sequence[str]) -> dict[str, str]:
         kinds: of `KINDS`, each once.
     """
     drivers = driver_names(name, kinds)
-    inside = [_IN_RIG.get(kind, ("", "")) for kind in kinds]
+    inside = {d: (k, *_IN_RIG.get(k, ("", ""))) for d, k in zip(drivers, kinds, strict=True)}
+    in_rig = {driver: part for driver, part in inside.items() if KINDS[part[0]]}
+    files = ["rig.yaml"] if in_rig else []
+    files += ["streams.yaml"] if len(in_rig) < len(inside) else []
     words = {
         "project": name.replace("_", "-"),
         "title": " and ".join(drivers),
@@ -150,15 +166,21 @@ def package_files(name: str, kinds: Sequence[str]) -> dict[str, str]:
         "packages": ", ".join(f'"{driver}"' for driver in drivers),
         "devices": "\n".join(
             f"  {KINDS[kind]}: {{driver: {driver}{device}}}"
-            for kind, driver, (device, _) in zip(kinds, drivers, inside, strict=True)
+            for driver, (kind, device, _) in in_rig.items()
         ),
-        "more": _joined([more for _, more in inside]),
+        "streams": "\n".join(
+            f"  {driver}: {{kind: scalar, unit: degC, device: {{driver: {driver}}}}}"
+            for driver in inside
+            if driver not in in_rig
+        ),
+        "more": _joined([more for _, _, more in in_rig.values()]),
+        "files": "\n\n".join(_FILES[name] for name in files),
     }
     found = {
         "pyproject.toml": PYPROJECT.substitute(words),
         "README.md": README.substitute(words, name=name if len(kinds) == 1 else f"{name}_KIND"),
-        "rig.yaml": RIG.substitute(words),
     }
+    found |= {name: _TEXTS[name].substitute(words) for name in files}
     for driver, kind in zip(drivers, kinds, strict=True):
         found |= _driver_files(driver, kind)
     return found
@@ -198,7 +220,7 @@ def _driver_files(name: str, kind: str) -> dict[str, str]:
         text = text.replace(example, class_name).replace(f"example_{kind}", name)
         text = re.sub(
             r"(?:the e|E)xample (?:arm|event camera|frame camera|sync box|"
-            r"force sensor|gripper)",
+            r"force sensor|gripper|scalar sensor)",
             name,
             text,
         )

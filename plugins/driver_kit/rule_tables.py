@@ -15,9 +15,9 @@ from sliplab.plugins.driver_kit.rule import Rules
 
 _RULES: dict[str, tuple[Rules[Any], ...]] = {
     "Arms": (arm_rules.RULES, motion_rules.RULES),
-    "Cameras, force sensors and sync boxes": (stream_rules.RULES,),
+    "Cameras, sensors and sync boxes": (stream_rules.RULES,),
     "Cameras with a clock, and force sensors": (stream_rules.CLOCK_RULES,),
-    "Frame cameras and force sensors": (stream_rules.HOST_RULES,),
+    "Frame cameras and sensors": (stream_rules.HOST_RULES,),
     "Event cameras": (stream_rules.EVENT_RULES,),
     "Frame cameras": (stream_rules.FRAME_RULES,),
     "Force sensors": (stream_rules.FORCE_RULES,),

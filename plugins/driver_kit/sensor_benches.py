@@ -1,9 +1,10 @@
-"""Benches of force sensors and sync boxes, each on its fake."""
+"""Benches of sensors and sync boxes, each on its fake."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,13 @@ import numpy as np
 from sliplab.plugins.driver_kit.arm_bench import ArmBench
 from sliplab.plugins.driver_kit.arm_report import clock_offset_ns
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
-from sliplab.plugins.driver_kit.stream_bench import BATCHES, StreamBench
+from sliplab.plugins.driver_kit.stream_bench import BATCHES, MS_NS, StreamBench
 from sliplab.protocols.timing import Code
-from sliplab.rigs.core.capabilities import ForceSensor, SyncBox
-from sliplab.rigs.core.driver import ForceSensorDriver, PulseTrain, SyncBoxDriver
+from sliplab.rigs.core.capabilities import ForceSensor, Sensor, SyncBox
+from sliplab.rigs.core.driver import ForceSensorDriver, PulseTrain, SensorDriver, SyncBoxDriver
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.pulse_code import CodeBits
-from sliplab.storage.streams import F64, PulseChunk, WrenchChunk
+from sliplab.storage.streams import F64, SCALAR, PulseChunk, WrenchChunk
 
 LOAD = np.array([1.0, -2.0, 5.0, 0.1, 0.2, -0.3])
 """Force in N and torque in N m that a fake feels."""
@@ -82,6 +83,59 @@ class ForceBench(StreamBench):
     def overload(self) -> None:
         """Let the load be out of range from now on."""
         self.fake.overload()
+
+
+class SensorBench(StreamBench):
+    """A sensor of rows of numbers, each of which tells its row: they count on."""
+
+    capability = Sensor
+
+    def __init__(self, driver: SensorDriver[Any], settings: Any, bounds: Bounds) -> None:
+        super().__init__(driver, settings, bounds)
+        if driver.fake is None or driver.reach is None:
+            raise NotTried(f"{driver.name} declares no fake")
+        self._build: Callable[[Any], Sensor] = driver.build
+        self.fake = driver.fake(settings)
+        self.settings = driver.reach(settings, self.fake.address)
+        self._sent = 0
+
+    def open(self) -> None:
+        """Connect the sensor, which then knows its columns. Raises RigError."""
+        self.device = self._build(self.settings)
+        self.device.connect()
+        kind = getattr(self.device, "kind", SCALAR)
+        numbers = [column.field for column in kind.columns.values() if column.dtype == "float64"]
+        self.clock_field, self.fields = numbers[0], tuple(numbers)
+
+    def close_fake(self) -> None:
+        """Close the fake."""
+        self.fake.close()
+
+    def feed(self) -> None:
+        """Send ten rows within 10 ms."""
+        number = 1.0 + self._sent + np.arange(10)
+        self._sent += 10
+        rows = {name: number + column for column, name in enumerate(self.fields)}
+        self.fed.append(SimpleNamespace(**rows))
+        self.fake.send({"t": self.times(10, MS_NS), **rows})
+
+    def mark(self) -> int | None:
+        """Return the number of the next row."""
+        return self._sent + 1
+
+    def silence(self) -> None:
+        """Silence the fake."""
+        self.fake.silence()
+
+    def unplug(self) -> None:
+        """Unplug the fake."""
+        self.fake.close()
+
+    def turn_back(self) -> None:
+        """Let the sensor's clock fall back. Raises NotTried: it has none."""
+        if not self.fake.clocked:
+            raise NotTried("its rows have no times of a clock that must not fall back")
+        super().turn_back()
 
 
 class ArmForceBench(StreamBench):

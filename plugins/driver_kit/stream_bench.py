@@ -30,7 +30,8 @@ class StreamBench(DeviceBench):
     """A device that streams, and its fake, which sends what the bench feeds it."""
 
     capability: ClassVar[type]
-    clock_field: ClassVar[str] = "t_ns"
+    clock_field: str = "t_ns"
+    """Field of a chunk that rises from row to row."""
     fields: tuple[str, ...] = ()
     """Fields of a chunk that must come as they were sent."""
     slack_ns: int = 0

@@ -61,12 +61,12 @@ def write(request: ExportRequest) -> ExportResult:
         now()[:10],
     )
     publication = Publication(opened, campaigns, about, _splits(campaigns))
-    if licence is None:
-        console.say("warning: no --licence: nobody may use the data until there is one")
     with console.bar("publish (trials)", publication.count) as bar:
         result = publish_as(
             publication, request.output, request.form, lambda name: bar.advance(1, name)
         )
+    if licence is None:
+        console.say("warning: no --licence: nobody may use the data until there is one")
     mark = " (simulated data)" if publication.simulated else ""
     return ExportResult(f"published in {request.output}{mark}", result)
 

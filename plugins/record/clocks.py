@@ -6,20 +6,30 @@ The host's clock takes the place of the sync box, so the maps are fitted as thos
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.analysis.clocks.synchronise import (
     ClockInput,
     clocks_in,
     streams_of,
     synchronise,
 )
-from sliplab.plugins.record.sources import CLOCK_STREAM, FIRST_CAMERAS, HOST, READS, SourceAbout
+from sliplab.plugins.record.sources import (
+    CLOCK_STREAM,
+    FIRST_CAMERAS,
+    HOST,
+    SHARED,
+    TIMING,
+    SourceAbout,
+)
 from sliplab.plugins.record.table import CLOCK
+from sliplab.plugins.record.tapped import clock_by_taps
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema.trial import DeviceRecord
@@ -31,21 +41,39 @@ from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 
 @dataclass(frozen=True)
 class Clocks:
-    """Maps onto the host's clock by stream, and why others have none."""
+    """Maps onto the host's clock by stream, why others have none, and why there is none by taps."""
 
     found: dict[str, DeviceRecord] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
+    tap: str = ""
 
 
 def fit_clocks(
-    folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]
+    folder: Path,
+    sources: Mapping[str, SourceAbout],
+    span_ns: tuple[int, int],
+    tap: tuple[str, str] | None = None,
+    taps_ns: Sequence[int] = (),
 ) -> Clocks:
     """Fit the clocks of a sealed trial.
 
     Args:
         sources: streams that have rows.
         span_ns: begin and end of the trial on the host's clock.
+        tap, taps_ns: see `plugins.record.tapped`.
     """
+    result = _fitted(folder, sources, span_ns)
+    if tap is None or not result.found.keys() >= set(tap):
+        return result
+    with StreamReader(folder / DATA) as reader:
+        try:
+            found = clock_by_taps(reader, tap, sources[tap[0]], result.found, taps_ns)
+            return replace(result, found={**result.found, tap[0]: found})
+        except (NoMatchError, ValueError) as error:
+            return replace(result, tap=str(error))
+
+
+def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]) -> Clocks:
     result = Clocks()
     timed = {}
     for name, source in sources.items():
@@ -59,12 +87,12 @@ def fit_clocks(
     by_timing = {
         name: each.record
         for name, each in timed.items()
-        if each.clock != READS and name not in FIRST_CAMERAS
+        if each.clock == TIMING and name not in FIRST_CAMERAS
     }
     inputs, errors = clocks_in(folder, by_timing), {}
     with StreamReader(folder / DATA) as reader:
         for name, source in timed.items():
-            if source.clock == READS:
+            if source.clock != TIMING:
                 timing = source.record.timing or StreamTiming()
                 how = timing.model_copy(update={"grade": "device time stamps"})
                 reads, errors[name] = _reads(reader, name)
@@ -82,8 +110,12 @@ def fit_clocks(
             result.refused[name] = fitted.refused[name]
             continue
         record, error = fitted.devices[name].record(), errors.get(name, 0)
-        bound = (record.uncertainty_ns or 0.0) + error
-        result.found[name] = record.model_copy(update={"uncertainty_ns": bound})
+        source = timed[name]
+        changed: dict[str, Any] = {"uncertainty_ns": (record.uncertainty_ns or 0.0) + error}
+        if source.clock in SHARED:
+            changed["grade"] = source.clock
+            changed["uncertainty_ns"] += source.uncertainty_ns or 0.0
+        result.found[name] = record.model_copy(update=changed)
     return result
 
 
@@ -94,6 +126,7 @@ def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:
     """
     group = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}"
     t_ns, before, after, error = (reader.column(f"{group}/{part}") for part in CLOCK.columns)
-    some = slice(None, None, max(1, len(t_ns) // 4000))
+    # an odd step: of a shared clock every other reading is an arrival
+    some = slice(None, None, max(1, len(t_ns) // 4000) | 1)
     reads = ClockReads(t_ns[some], (before - error)[some], (after + error)[some])
     return reads, int(error.max(initial=0))

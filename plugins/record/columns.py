@@ -30,7 +30,8 @@ from sliplab.protocols.timing import StreamGrade
 from sliplab.protocols.yaml_file import rule
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.device_settings import DriverSettings
-from sliplab.rigs.core.driver import SensorDriver
+from sliplab.rigs.core.driver import SensorDriver, lazy
+from sliplab.rigs.core.network import serial_port
 from sliplab.rigs.core.stream_buffer import StreamBuffer
 from sliplab.storage.streams import Chunk, Json
 
@@ -38,7 +39,7 @@ DEVICE = "columns"
 OPEN_S, WAIT_S = 5.0, 0.2
 _MOST_LINE = 1 << 16
 """Bytes without an end of line that are no lines."""
-_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
 class ColumnsSettings(DriverSettings):
@@ -58,6 +59,11 @@ class ColumnsSettings(DriverSettings):
     time_column: str | None = None
     """Column with the device's time; without it rows are timed by their arrival."""
     time_unit: Literal["s", "ms", "us", "ns"] = "ms"
+    shared_clock: Literal["ptp", "utc"] | None = None
+    """Clock of the time column where the host has it too: TAI by PTP, or UTC. `sliplab record`
+    uses it; a rig times such rows by their arrival."""
+    uncertainty_ms: float | None = Field(default=None, gt=0, le=1000)
+    """Bound of the error of a shared clock's times, of device and host together, milliseconds."""
     start: str = ""
     """Text that is sent when the connection opens, such as `START\\n`."""
     stall_s: float = Field(default=5.0, ge=0.1, le=3600)
@@ -69,6 +75,13 @@ class ColumnsSettings(DriverSettings):
         return {
             name: unit for name, unit in self.columns.items() if name not in {"-", self.time_column}
         }
+
+    @rule
+    def _clock_is_stated(self) -> ColumnsSettings:
+        if self.shared_clock is not None and None in (self.time_column, self.uncertainty_ms):
+            text = "needs time_column and uncertainty_ms"
+            raise KeyedError(".shared_clock", self.shared_clock, text)
+        return self
 
     @rule
     def _columns_fit(self) -> ColumnsSettings:
@@ -163,7 +176,7 @@ class ColumnsSensor:
         host = np.full(len(values), host_ns)
         t_ns = host
         if settings.time_column is not None:
-            t_ns = np.rint(by_name[settings.time_column] * _UNITS[settings.time_unit])
+            t_ns = np.rint(by_name[settings.time_column] * UNITS[settings.time_unit])
             t_ns = t_ns.astype(np.int64)
         part = {"t": t_ns, "host": host, **{name: by_name[name] for name in settings.stored}}
         self.received += len(values)
@@ -233,6 +246,8 @@ def grade(settings: ColumnsSettings) -> StreamGrade:
 
 def why_unreachable(settings: ColumnsSettings) -> str | None:
     """Return why a port or socket cannot be opened; None if it can."""
+    if "://" not in settings.place:
+        return serial_port(settings.place)
     try:
         _, close = _open(settings)
     except (OSError, ValueError) as error:
@@ -251,4 +266,6 @@ DRIVER = SensorDriver(
     build=ColumnsSensor,
     stream=table_kind({"value": ""}),
     grade=grade,
+    fake=lazy("sliplab.plugins.record.columns_fake:FakeColumns"),
+    reach=lambda settings, address: settings.model_copy(update={"place": address}),
 )

@@ -24,7 +24,7 @@ app = typer.Typer()
 LOOK_S, SHOWN_S = 0.05, 0.5
 KEY_ERROR_MS = 500.0
 """Bound of the error of a mark by a key: a person's reaction."""
-KEYS = "space: start, stop; m: mark slip; q: quit"
+KEYS = "space: start, stop; m: mark slip; t: mark tap; q: quit"
 
 
 @app.command(
@@ -58,6 +58,10 @@ def record(
         Path | None,
         typer.Option("--analysis", help="Settings (YAML) of the analysis, as in an adapter."),
     ] = None,
+    tap: Annotated[
+        str | None,
+        typer.Option("--tap", help="Two sensors that feel the same taps: imu,grip; key t marks."),
+    ] = None,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Mark the trials as simulated.")
     ] = False,
@@ -83,6 +87,7 @@ def record(
             operator=operator,
             simulated=simulated,
             analysis=analysis,
+            tap=None if tap is None else _two(tap),
             collects=True,
         ) as recorder,
         pressed_keys() as key,
@@ -172,6 +177,8 @@ class _Session:
                 self.end()
         elif key == "m" and self.trial is not None:
             self.trial.mark("slip", uncertainty_ms=KEY_ERROR_MS)
+        elif key == "t" and self.trial is not None:
+            self.trial.mark("tap", uncertainty_ms=KEY_ERROR_MS)
         return key != "q"
 
     def _begin(self) -> None:
@@ -208,6 +215,13 @@ def _seconds(option: str, text: str) -> float:
     except ValidationError as error:
         raise InputError(option, "", text, "must be a time with its unit, such as 60s") from error
     return float(value)
+
+
+def _two(text: str) -> tuple[str, str]:
+    first, comma, second = text.partition(",")
+    if not (first and comma and second):
+        raise InputError("--tap", "", text, "must be two streams, such as imu,grip")
+    return first, second
 
 
 def _pair(text: str) -> tuple[str, object]:

@@ -25,7 +25,8 @@ from sliplab.plugins.record.table import CLOCK, chunk_type, rows, table_kind
 from sliplab.protocols.later import need
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.device_settings import DriverSettings
-from sliplab.rigs.core.driver import SensorDriver
+from sliplab.rigs.core.driver import SensorDriver, lazy
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.storage.streams import I64, Chunk, Column, Json, StreamKind
 
 DEVICE = "LSL stream"
@@ -53,6 +54,8 @@ class LslSettings(DriverSettings):
     """Of its sender, where several have streams of this name."""
     find_s: float = Field(default=5.0, gt=0, le=60)
     """Time to find it, seconds."""
+    stall_s: float = Field(default=10.0, ge=0.1, le=3600)
+    """Silence that is a fault, seconds: of a stream with a rate, or of its sender's clock."""
 
 
 class Reading(NamedTuple):
@@ -185,6 +188,7 @@ class LslStream:
         self._reads: list[tuple[int, int, int, int]] = []
         self._waiting = self.lost = self.received = 0
         self._last_t: int | None = None
+        self._silence, self._unread_clock = StallTimer(), StallTimer()
 
     def connect(self) -> None:
         """Find the stream, and take a first reading of its clock. Raises RigError."""
@@ -248,8 +252,9 @@ class LslStream:
         with self._lock:
             parts, self._ready = self._ready, []
             self._waiting -= sum(len(part[0]) for part in parts)
-            if not parts and self._fault is not None:
-                raise RigError(f"{DEVICE} {self._settings.name}", self._fault)
+            fault = None if parts else self._fault or (self._silent() if self._running else None)
+        if fault is not None:
+            raise RigError(f"{DEVICE} {self._settings.name}", fault)
         if not parts:
             return chunk_type(self.kind).empty()
         t_ns, host, stamp, values = map(np.concatenate, zip(*parts, strict=True))
@@ -259,6 +264,17 @@ class LslStream:
         self._last_t = int(t_ns[-1])
         columns = (t_ns, host, stamp, *np.ascontiguousarray(values.T))
         return rows(self.kind, "", dict(zip(self.kind.columns, columns, strict=True)))
+
+    def _silent(self) -> str | None:
+        """Return for how long nothing has come, where that is a fault."""
+        limit_s, quiet_s = self._settings.stall_s, self._silence.waited_s(self.received)
+        if self._info.nominal_srate() > 0 and quiet_s > limit_s:
+            return f"sent nothing for {quiet_s:.1f} s; look at its sender"
+        # the sender of marks may be silent, but answers when its clock is read
+        quiet_s = self._unread_clock.waited_s(self._history[-1].device_ns)
+        if quiet_s > limit_s + READ_S:
+            return f"its clock could not be read for {quiet_s:.1f} s; look at its sender"
+        return None
 
     def clock_reads(self) -> Chunk:
         """Return the readings of the clock since the last call; their times are without jumps."""
@@ -406,4 +422,6 @@ DRIVER = SensorDriver(
     build=LslStream,
     stream=table_kind({"value": ""}),
     grade=lambda settings: "host time",
+    fake=lazy("sliplab.plugins.record.lsl_fake:FakeLsl"),
+    reach=lambda settings, address: settings.model_copy(update=address),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +24,8 @@ from sliplab.storage.streams import (
 
 MOST_BYTES = 256 * 10**6
 """Pushed data that wait to be written; more are lost, and counted."""
+READ_BYTES = 16 * 10**6
+"""Data that are read at once, so that a program that pushes too fast costs no more memory."""
 _DAY_NS = 86_400 * 10**9
 
 
@@ -56,7 +59,7 @@ class PushedStream:
         self._reset()
 
     def _reset(self) -> None:
-        self._parts: list[Chunk] = []
+        self._parts: deque[Chunk] = deque()
         self._bytes = self._number = 0
         self._last: int | None = None
         self.lost = self.late = 0
@@ -107,7 +110,7 @@ class PushedStream:
         """
         now = time.monotonic_ns()
         chunk = self._chunk(now, t, values, named)
-        size = sum(array.nbytes for array in chunk._arrays().values())
+        size = _bytes(chunk)
         with self._lock:
             if not self._running:
                 raise RuntimeError(f"stream '{self._name}': no trial is being recorded")
@@ -121,9 +124,14 @@ class PushedStream:
             self._bytes += size
 
     def read(self) -> Chunk:
-        """Return the rows since the last call, in order of time; late ones are left out."""
+        """Return rows since the last call, in order of time; late ones are left out."""
+        parts: list[Chunk] = []
+        size = 0
         with self._lock:
-            parts, self._parts, self._bytes = self._parts, [], 0
+            while self._parts and size < READ_BYTES:
+                parts.append(self._parts.popleft())
+                size += _bytes(parts[-1])
+            self._bytes -= size
         chunk = type(parts[0]).concatenate(parts) if parts else self.empty()
         if not len(chunk):
             return chunk
@@ -136,6 +144,11 @@ class PushedStream:
         if len(chunk):
             self._last = int(chunk.times[-1])
         return chunk
+
+    @property
+    def waiting(self) -> bool:
+        """Whether rows wait to be read."""
+        return bool(self._parts)
 
     def read_pulses(self) -> Chunk:
         """Return no pulse: none is wired to a program."""
@@ -190,3 +203,7 @@ class PushedStream:
             raise InputError(self._name, "images", f"{images.dtype} {images.shape}", text)
         number, host = np.arange(n, dtype=np.int64), np.full(n, now)
         return FrameChunk(images.copy(), number, times, host, np.zeros(n, np.uint8))
+
+
+def _bytes(chunk: Chunk) -> int:
+    return sum(array.nbytes for array in chunk._arrays().values())

@@ -26,6 +26,7 @@ from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
 from sliplab.plugins.record.sources import Source, opened
+from sliplab.plugins.record.tapped import check_tap
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
@@ -65,6 +66,8 @@ class Recorder:
         simulated: mark the trials as simulated.
         analysis: YAML file with `analysis`, `split`, `experiment`, `title` or `about`, as in an
             adapter (docs/adapters.md).
+        tap: names of two sensors that feel the same taps: the clock of the first is then known by
+            the second, near marks named ``tap`` or anywhere in a trial.
         collects: `sliplab stop` ends this program.
 
     Raises:
@@ -82,8 +85,10 @@ class Recorder:
         operator: str = "",
         simulated: bool = False,
         analysis: str | Path | None = None,
+        tap: tuple[str, str] | None = None,
         collects: bool = False,
     ) -> None:
+        self._tap = tap
         self._streams = [streams] if isinstance(streams, (str, Path, Source)) else list(streams)
         self._store, self._name = Path(store), safe_name(campaign)
         self._operator, self._simulated = operator, simulated
@@ -99,6 +104,8 @@ class Recorder:
     def __enter__(self) -> Self:
         with ExitStack() as undo, ExitStack() as devices:
             self.sources = opened(self._streams, devices)  # wrong input writes nothing
+            if self._tap is not None:
+                check_tap(self._tap, self.sources)
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
@@ -312,6 +319,7 @@ class RecordedTrial:
             started=datetime.now(UTC).isoformat(timespec="milliseconds"),
             operator=recorder._operator,
             sources={source.name: source.about for source in recorder.sources},
+            tap=recorder._tap,
         )
         try:
             self._stream(writer, begun)

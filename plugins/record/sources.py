@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
@@ -50,6 +51,8 @@ from sliplab.storage.streams import (
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"
 """How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
 by the timing that its file says."""
+SHARED = {"ptp": time.CLOCK_TAI, "utc": time.CLOCK_REALTIME}
+"""Clocks that devices and the host share, as the host has them: by PTP (TAI), or UTC."""
 _SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
 FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
 CLOCK_STREAM = "{}_clock"
@@ -71,7 +74,7 @@ class SourceAbout(BaseModel):
     record: StreamRecord
     clock: str
     uncertainty_ns: float | None = None
-    """Of stamps of the host's clock, where it is stated."""
+    """Of stamps of the host's clock or of a shared one, where it is stated."""
 
 
 @dataclass
@@ -79,7 +82,7 @@ class Source:
     """A stream that is recorded.
 
     Attributes:
-        clock: `HOST`, `READS` or `TIMING`.
+        clock: `HOST`, `READS`, `TIMING`, or a name of `SHARED`.
         uncertainty_ns: see `SourceAbout`.
         locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
         fault: why it has ended within the trial; None while it runs.
@@ -114,7 +117,8 @@ class Source:
     def expected(self) -> dict[str, tuple[Chunk, ...]]:
         """Return empty chunks of what may come, by stream; the device is connected."""
         clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
-        return {self.name: self._chunks()} | (clock if self.clock == READS else {})
+        read = self.clock == READS or self.clock in SHARED
+        return {self.name: self._chunks()} | (clock if read else {})
 
     def _chunks(self) -> tuple[Chunk, ...]:
         kind, unit = self.stream.about.kind, self.stream.about.unit or ""
@@ -141,11 +145,16 @@ class Source:
             last: stop, and read what was sent before.
         """
         seen = _Newest(sink, self)
+        pushed = self.device if isinstance(self.device, PushedStream) else None
+        if last and pushed is not None:
+            pushed.stop()  # nothing comes between the last read and the end
         self.stream.drain(seen)
+        while last and pushed is not None and pushed.waiting:
+            self.stream.drain(seen)
         if last:
             self.stream.finish(seen)
         now = time.monotonic_ns()
-        if self.clock == READS:
+        if self.clock == READS or self.clock in SHARED:
             sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
         self._drained_ns = now
 
@@ -154,27 +163,34 @@ class Source:
         if hasattr(self.device, "clock_reads"):
             found: Chunk = self.device.clock_reads()
             return found
-        if seen.newest_us is None:
-            return chunk_type(CLOCK).empty()
-        timing = self.stream.about.timing or StreamTiming()
-        # the newest event came after the call before, and was sent not longer before than its way
-        before = self._drained_ns - round(timing.delay.longest_us * 1000)
-        read = {"t": [seen.newest_us * 1000], "before": [before], "after": [now], "error": [0]}
-        return rows(CLOCK, "", read)
+        found = []
+        if seen.newest_ns is not None:
+            timing = self.stream.about.timing or StreamTiming()
+            error = round(self.uncertainty_ns or 0)
+            # the newest row came after the call before, and was sent not longer before than its way
+            before = self._drained_ns - round(timing.delay.longest_us * 1000)
+            found.append((seen.newest_ns, before - error, now + error, 0))
+        if self.clock in SHARED:
+            before = time.monotonic_ns()
+            t_ns = time.clock_gettime_ns(SHARED[self.clock])
+            found.append((t_ns, before, time.monotonic_ns(), 0))
+        columns = np.array(found, np.int64).reshape(-1, 4).T
+        return rows(CLOCK, "", dict(zip(CLOCK.columns, columns, strict=True)))
 
 
 class _Newest:
-    """A sink that counts a source's rows, and notes its newest event."""
+    """A sink that counts a source's rows, and notes the time of its newest."""
 
     def __init__(self, sink: Sink, source: Source) -> None:
         self._sink, self._source = sink, source
-        self.newest_us: int | None = None
+        self.newest_ns: int | None = None
 
     def add(self, device: str, chunk: Chunk) -> None:
-        if isinstance(chunk, EventChunk) and len(chunk):
-            self.newest_us = int(chunk.t_us[-1])
         if not isinstance(chunk, (PulseChunk, ClockReads)):
             self._source.rows += len(chunk)
+            if len(chunk):
+                unit = 1000 if isinstance(chunk, EventChunk) else 1
+                self.newest_ns = int(chunk.times[-1]) * unit
         self._sink.add(device, chunk)
 
 
@@ -194,8 +210,10 @@ def push(
         columns: of numbers: the unit of each column by its name.
         events_px, frames_px: columns and rows of a camera, in place of columns.
         clock: ``host``: times are of ``time.monotonic_ns()``; ``own``: of a clock of its own, which
-            is bounded by the times at which rows are pushed.
-        uncertainty_ms: bound of the error of times of the host's clock; None where it is unknown.
+            is bounded by the times at which rows are pushed; ``ptp`` or ``utc``: of TAI or UTC,
+            which the host has too, by PTP or NTP: refused where the times of pushing contradict it.
+        uncertainty_ms: bound of the error of times of the host's clock, None where it is unknown;
+            of ``ptp`` and ``utc`` it must be stated.
 
     Raises:
         InputError: an argument.
@@ -203,8 +221,10 @@ def push(
     given = [each for each in (columns, events_px, frames_px) if each is not None]
     if len(given) != 1:
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
-    if clock not in {"host", "own"}:
-        raise InputError(name, "clock", clock, "must be host or own")
+    if clock not in {"host", "own", *SHARED}:
+        raise InputError(name, "clock", clock, "must be host, own, ptp or utc")
+    if clock in SHARED and uncertainty_ms is None:
+        raise InputError(name, "uncertainty_ms", None, f"is needed with clock={clock!r}")
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
     _check_name(name, kind)
     size = events_px or frames_px
@@ -221,7 +241,7 @@ def push(
         told["timing"] = StreamTiming(grade=grade)
         how = READS if kind == EVENTS_KIND else TIMING
     else:
-        how = HOST
+        how = clock if clock in SHARED else HOST
     error = None if uncertainty_ms is None else uncertainty_ms * 1e6
     return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
 
@@ -395,7 +415,10 @@ def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
         raise InputError(name, "driver", driver.name, "measures through an arm, which is not there")
     made = driven_stream(name, stream, None, plate)  # type: ignore[arg-type]
     by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
-    return Source(made, READS if by_reads else TIMING, locks=driver.locks(stream.device))
+    locks = driver.locks(stream.device)
+    if (shared := getattr(stream.device, "shared_clock", None)) is not None:
+        return Source(made, shared, stream.device.uncertainty_ms * 1e6, locks=locks)
+    return Source(made, READS if by_reads else TIMING, locks=locks)
 
 
 def _check_name(name: str, kind: str | None) -> None:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 
 from sliplab.plugins.record.clocks import Clocks, fit_clocks
 from sliplab.plugins.record.sources import FIRST_CAMERAS, SourceAbout
+from sliplab.plugins.record.tapped import TAP
 from sliplab.storage.schema.trial import (
     Gate,
     Geometry,
@@ -37,6 +38,7 @@ class BegunTrial(BaseModel):
 
     Attributes:
         begin_ns: on the host's clock. started: UTC, ISO 8601.
+        tap: two sensors that felt the same taps.
     """
 
     trial: str
@@ -50,6 +52,7 @@ class BegunTrial(BaseModel):
     operator: str = ""
     sources: dict[str, SourceAbout]
     marks: list[Mark] = Field(default_factory=list)
+    tap: tuple[str, str] | None = None
 
 
 def make_record(
@@ -73,7 +76,8 @@ def make_record(
     streams = _streams(folder, begun)
     counted = {name: rows for name, (rows, _) in streams.items()}
     present = {name: each for name, each in begun.sources.items() if counted.get(name)}
-    clocks = fit_clocks(folder, present, span)
+    tapped = [mark.t_ns for mark in begun.marks if mark.name == TAP]
+    clocks = fit_clocks(folder, present, span, begun.tap, tapped)
     gates = {
         f"clock_{name}": Gate(passed=False, value=why)
         for name, why in clocks.refused.items()
@@ -83,6 +87,9 @@ def make_record(
     inside = [mark for mark in marks if span[0] <= mark.t_ns <= span[1]]
     notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
     notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
+    notes += (
+        [f"the clock of {begun.tap[0]} by taps: {clocks.tap}"] if clocks.tap and begun.tap else []
+    )
     notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
     about: dict[str, Any] = {
         "format": FORMAT,

@@ -335,6 +335,26 @@ class GripperDriver(Driver[GripperSettingsT]):
     """Return settings that reach a fake at an address."""
 
 
+class FakeSensor(Protocol):
+    """A fake sensor that sends rows of numbers."""
+
+    clocked: bool
+    """Its rows have the times of a clock of its own, which must not fall back."""
+
+    @property
+    def address(self) -> Any:
+        """Address for the driver, used by `SensorDriver.reach`."""
+
+    def send(self, rows: Mapping[str, Any]) -> None:
+        """Send rows: arrays (n,) of times `t`, ns, and of each column by its stored name."""
+
+    def silence(self) -> None:
+        """Send nothing from now on."""
+
+    def close(self) -> None:
+        """Unplug it; any number of times."""
+
+
 @dataclass(frozen=True)
 class SensorDriver(Driver[SettingsT]):
     """A kind of sensor of one quantity, or of another kind of stream."""
@@ -346,6 +366,10 @@ class SensorDriver(Driver[SettingsT]):
     """The kind of its stream; None for readings of one quantity."""
     grade: Callable[[SettingsT], StreamGrade] | None = None
     """Return the only grade of its times; None: as the rig file says."""
+    fake: Callable[[SettingsT], FakeSensor] | None = None
+    """Make a fake, for tests of the driver."""
+    reach: Callable[[SettingsT, Any], SettingsT] | None = None
+    """Return settings that reach a fake at an address."""
 
     @property
     def sends(self) -> str:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import socket
 import threading
+import tty
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
@@ -170,10 +172,15 @@ class FakeStream(ABC):
         self._client: asyncio.StreamWriter | None = None
         self._connections = Connections()
         self._thread = LoopThread(name)
-        self.address = LOOPBACK, self._thread.call(self._listen)
+        self.address: Any = self._thread.call(self._open)
 
-    def _listen(self) -> int:
-        return self._connections.listen(LOOPBACK, 0, self._accept)
+    def _open(self) -> Any:
+        """Open the port, in the loop; return its address."""
+        return LOOPBACK, self._connections.listen(LOOPBACK, 0, self._accept)
+
+    def _cut(self) -> None:
+        """Close the port, in the loop."""
+        self._connections.cut()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._client = writer
@@ -199,15 +206,56 @@ class FakeStream(ABC):
         if self._client.transport.get_write_buffer_size() > MOST_WAITING:
             self._client.transport.abort()
 
-    def silence(self) -> None:
+    def silence(self, silent: bool = True) -> None:
         """Send and answer nothing from now on; the connection stays."""
-        self._silent = True
+        self._silent = silent
 
     def close(self) -> None:
         """Unplug it: the connection breaks. Safe to call more than once."""
         if self._thread.alive:
-            self._thread.call(self._connections.cut)
+            self._thread.call(self._cut)
             self._thread.close()
+
+
+class FakeSerial(FakeStream):
+    """Base class of fake devices on a serial line, which is a pseudo terminal.
+
+    What nobody reads is lost, as on a real line, and so is what a silent device is sent.
+
+    Attributes:
+        address: name of the port. lost: times that the line was full.
+    """
+
+    lost = 0
+
+    def _open(self) -> str:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        loop, self._reader = asyncio.get_running_loop(), asyncio.StreamReader()
+        loop.add_reader(self._master, self._receive)
+        self._serving = loop.create_task(self._serve(self._reader))
+        return os.ttyname(self._slave)
+
+    def _receive(self) -> None:
+        data = os.read(self._master, 4096)
+        if not self._silent:
+            self._reader.feed_data(data)
+
+    def _write(self, data: bytes) -> None:
+        if self._silent or self._master < 0:
+            return
+        try:
+            os.write(self._master, data)
+        except BlockingIOError:
+            self.lost += 1
+
+    def _cut(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._master)
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = -1
+        self._serving.cancel()
 
 
 CLOCK_BACK_S = 5.0

@@ -1,8 +1,9 @@
-"""Devices on the network: connections with bounded answers, and the lock of an arm."""
+"""Devices on the network or a serial port: bounded answers, and the lock of an arm."""
 
 from __future__ import annotations
 
 import math
+import os
 import socket
 import time
 from typing import Any
@@ -80,6 +81,15 @@ def answers(host: str, port: int) -> str | None:
             return None
     except OSError as error:
         return f"{host}:{port}: {error}; check its power, its cable and the address"
+
+
+def serial_port(port: str) -> str | None:
+    """Return None if a serial port may be opened, else the reason."""
+    if not os.path.exists(port):
+        return f"there is no {port}; check its cable and /dev/serial/by-id"
+    if not os.access(port, os.R_OK | os.W_OK):
+        return f"{port} may not be opened; add yourself to its group (dialout)"
+    return None
 
 
 def arm_lock(settings: BaseArmSettings) -> dict[str, str]:

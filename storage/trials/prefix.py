@@ -70,7 +70,7 @@ def _paths(folder: Path, name: str) -> tuple[Path, Path]:
 def _close(path: Path) -> None:
     """Clear the mark of a file that a killed program had open."""
     with path.open("r+b") as file:
-        if (head := closed(file.read(HEAD_BYTES))) is not None:
+        if (head := closed(file.read(HEAD_BYTES), path.stat().st_size)) is not None:
             file.seek(0)
             file.write(head)
 
@@ -81,7 +81,7 @@ def _last_match(folder: Path, name: str, states: Sequence[Json]) -> int:
     last = len(states) - 1
     try:
         with data.open("rb") as raw:
-            head = closed(raw.read(HEAD_BYTES)) or b""
+            head = closed(raw.read(HEAD_BYTES), data.stat().st_size) or b""
         with FileContent(data, head=head) as content, h5py.File(content, "r") as file:
             for column in states[0]["columns"]:
                 counts = [state["columns"][column] for state in states[: last + 1]]

@@ -19,17 +19,19 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 HEAD_BYTES = 48
 """Length of a superblock of version 2 or 3 with offsets of 8 bytes."""
 _VERSIONS = (2, 3)
-_FLAGS, _SUM = 11, 44
-"""Places of the flags, and of the superblock's own checksum."""
+_FLAGS, _END, _SUM = 11, 28, 44
+"""Places of the flags, of the file's end, and of the superblock's own checksum."""
 _MENDING = threading.Lock()
 _MASK = 0xFFFFFFFF
 
 
-def closed(head: bytes) -> bytes | None:
+def closed(head: bytes, size: int | None = None) -> bytes | None:
     """Return a superblock as it is once the file is closed.
 
     Args:
         head: the file's first `HEAD_BYTES` bytes.
+        size: of the file of a program that was killed: where the superblock says that it ends is
+            written last, and HDF5 reads nothing behind that.
 
     Returns:
         None if it is closed already, or is no superblock of these versions.
@@ -39,6 +41,8 @@ def closed(head: bytes) -> bytes | None:
     if head[8] not in _VERSIONS or head[9] != 8 or not head[_FLAGS]:
         return None
     plain = head[:_FLAGS] + b"\0" + head[_FLAGS + 1 : _SUM]
+    if size is not None:
+        plain = plain[:_END] + struct.pack("<Q", size) + plain[_END + 8 :]
     return plain + struct.pack("<I", lookup3(plain))
 
 

@@ -5,15 +5,8 @@ from __future__ import annotations
 import os
 
 from sliplab.rigs.core.driver import SyncBoxDriver, lazy
+from sliplab.rigs.core.network import serial_port
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-
-
-def _ping(settings: SyncBoxSettings) -> str | None:
-    if not os.path.exists(settings.port):
-        return f"there is no {settings.port}; check its cable and /dev/serial/by-id"
-    if not os.access(settings.port, os.R_OK | os.W_OK):
-        return f"{settings.port} may not be opened; add yourself to its group (dialout)"
-    return None
 
 
 def _locks(settings: SyncBoxSettings) -> dict[str, str]:
@@ -31,7 +24,7 @@ DRIVER = SyncBoxDriver(
     title="SlipLab sync box",
     settings=SyncBoxSettings,
     libraries=("serial",),
-    ping=_ping,
+    ping=lambda settings: serial_port(settings.port),
     address=lambda settings: settings.port,
     locks=_locks,
     build=lazy("sliplab.rigs.devices.sync_box.driver:SerialSyncBox"),

@@ -6,18 +6,16 @@ callable, so that a simulated scene can drive it.
 
 from __future__ import annotations
 
-import os
-import select
-import threading
+import asyncio
 import time
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import get_args
+from typing import Self, get_args
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.driver import OnTrain, PulseTrain
+from sliplab.rigs.core.fakes import FakeSerial
 from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 
@@ -25,7 +23,6 @@ TURN_S = 0.001
 """Period at which the fake sends due reports."""
 LEAD_US = 2000
 """Time from GO to tick 0."""
-JOIN_S = 2.0
 CODES: dict[str, Code] = {code: code for code in get_args(Code)}
 
 
@@ -44,8 +41,8 @@ class _Plan:
         return CodeBits(self.seed, self.code)
 
 
-class FakeSyncBox:
-    """A fake sync box on the pty `port`; a context manager that ends its thread.
+class FakeSyncBox(FakeSerial):
+    """A fake sync box on the pty `address`; a context manager that ends its thread.
 
     Args:
         now_ns: the box's clock with any origin; the box reports 0 at power-on and reset.
@@ -55,7 +52,6 @@ class FakeSyncBox:
             with None and the number of ticks sent.
 
     Attributes:
-        port: name of the pty.
         pulses: number of pulses (code bits 1) of the running or last train.
     """
 
@@ -66,74 +62,42 @@ class FakeSyncBox:
         exposure_us: int | None = None,
     ) -> None:
         self._now_ns, self._exposure_us, self._on_train = now_ns, exposure_us, on_train
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.port = os.ttyname(self._slave)
-        self._lock = threading.RLock()
-        self._ending = threading.Event()
-        self._silent, self._corrupt, self._drop = False, 0, 0
+        self._corrupt, self._drop = 0, 0
         self._late, self._held = False, b""
         self._train: _Plan | None = None
         self._sent = self.pulses = 0
         self._power_on()
-        self._thread = threading.Thread(target=self._work, name="pty sync box", daemon=True)
-        self._thread.start()
+        super().__init__("pty sync box")
 
-    def __enter__(self) -> FakeSyncBox:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def close(self) -> None:
-        """End the thread and the pty; to the host the board is unplugged."""
-        self._ending.set()
-        self._thread.join(JOIN_S)
-        with self._lock:
-            self._end()
-            for handle in (self._master, self._slave):
-                if handle >= 0:
-                    os.close(handle)
-            self._master = self._slave = -1
-
-    @property
-    def address(self) -> str:
-        """The port, for `reach` of the driver."""
-        return self.port
-
     # -- faults ----------------------------------------------------------------------------
 
-    def reset(self) -> None:
+    def reset(self, told: bool = True) -> None:
         """Restart as after a brown-out: no train, clock at 0, and the board's start message."""
-        with self._lock:
-            self._power_on()
-            self._say(f"B {NAME}")
-
-    def silence(self, silent: bool = True) -> None:
-        """Hang: neither read nor send until `silent` is False again."""
-        with self._lock:
-            self._silent = silent
+        self._thread.call(self._power_on)
+        if told:
+            self._thread.call(lambda: self._say(f"B {NAME}"))
 
     def answer_late(self) -> None:
         """Hold the answer to the next request back until the one after it."""
-        with self._lock:
-            self._late = True
+        self._late = True
 
     def corrupt(self, lines: int) -> None:
         """Garble the next `lines` sent lines."""
-        with self._lock:
-            self._corrupt = lines
+        self._corrupt = lines
 
     def drop(self, reports: int) -> None:
         """Drop the next `reports` reports as with a full buffer; their number is reported."""
-        with self._lock:
-            self._drop = reports
+        self._drop = reports
 
     def expose(self) -> None:
         """Simulate an exposure of the camera now, whose output is wired to the box."""
-        with self._lock:
-            self._stamps.append(self._us())
+        self._thread.call(lambda: self._stamps.append(self._us()))
 
     # -- the box ---------------------------------------------------------------------------
 
@@ -151,7 +115,7 @@ class FakeSyncBox:
         self._origin_ns = self._now_ns()
         self._lines = LineReader()
         self._armed: _Plan | None = None
-        self._first_us = self._sent = self._exposed = self._dropped = self._reported = 0
+        self._first_us = self._sent = self._exposed = self._dropped = self._reported = self.lost = 0
         self._stamps: list[int] = []
 
     def _us(self) -> int:
@@ -169,10 +133,7 @@ class FakeSyncBox:
                 self._late, self._held = False, line
                 return
             line, self._held = self._held + line, b""
-        try:
-            os.write(self._master, line)
-        except BlockingIOError:
-            self._dropped += 1  # nothing reads: a real line would lose it too
+        self._write(line)
 
     def _report(self, body: str) -> None:
         if self._drop:
@@ -181,14 +142,11 @@ class FakeSyncBox:
         else:
             self._say(body)
 
-    def _work(self) -> None:
-        while not self._ending.is_set():
-            waits = [] if self._silent else [self._master]
-            ready = select.select(waits, [], [], TURN_S)[0]
-            with self._lock:
-                if self._silent:
-                    continue
-                for body in self._lines.bodies(os.read(self._master, 4096) if ready else b""):
+    async def _serve(self, reader: asyncio.StreamReader) -> None:
+        self._turn()
+        try:
+            while data := await reader.read(4096):
+                for body in self._lines.bodies(data):
                     try:
                         self._obey(body)
                     except ValueError:
@@ -196,7 +154,15 @@ class FakeSyncBox:
                 for _ in range(self._lines.wrong):
                     self._say("E checksum")
                 self._lines.wrong = 0
-                self._tick()
+        finally:
+            self._timer.cancel()
+            self._end()
+
+    def _turn(self) -> None:
+        """Send the reports that are due; again after `TURN_S`."""
+        self._timer = asyncio.get_running_loop().call_later(TURN_S, self._turn)
+        if not self._silent:
+            self._tick()
 
     def _tick(self) -> None:
         """Send the reports that are due."""
@@ -219,9 +185,10 @@ class FakeSyncBox:
         while self._stamps and self._stamps[0] <= now_us:
             self._report(f"X {self._exposed} {self._stamps.pop(0)}")
             self._exposed += 1
-        if self._dropped != self._reported:
-            self._reported = self._dropped
-            self._say(f"D {self._dropped}")
+        dropped = self._dropped + self.lost
+        if dropped != self._reported:
+            self._reported = dropped
+            self._say(f"D {dropped}")
 
     def _obey(self, body: str) -> None:
         command, _, rest = body.partition(" ")
@@ -260,6 +227,7 @@ class FakeSyncBox:
             self._say("E code must be lfsr, irregular or regular")
         else:
             self._armed = _Plan(round(float(hz) * 1000), int(ticks), int(seed), CODES[code])
-            self._sent = self._exposed = self._dropped = self._reported = self.pulses = 0
+            self._sent = self._exposed = self._dropped = self._reported = 0
+            self.pulses = self.lost = 0
             self._stamps = []
             self._say("OK ARM")

@@ -19,7 +19,7 @@ from sliplab.plugins.align.align import UNKNOWN
 from sliplab.plugins.align.clock_state import ClockState
 from sliplab.plugins.align.events import events_from
 from sliplab.storage.streams import F64
-from tests.command_line import here
+from tests.command_line import answer, here
 
 RNG = 4
 
@@ -259,6 +259,11 @@ def test_files_of_strangers_are_read_or_their_fault_is_named(
 # lists that are refused, and the likely cause
 PAIRS = {
     "A in ms": (_table("t", "{:.6f}", 1e3), PLAIN, "1e3 times those of B: check the units"),
+    "us as s": (
+        _table("t", "{:.1f}", 1e6),
+        "\n".join(["t", *(f"{5e6 * t:.1f}" for t in _random_events(seed=9))]),
+        "s apart: is the unit right?; ",
+    ),
     "B in ms": (PLAIN, _table("t", "{:.6f}", 1e3), "1e-3 times those of B: check the units"),
     "two parts": (
         "\n".join(["t", *LINES[100:], *LINES[:100]]),
@@ -298,6 +303,8 @@ def test_refusals_name_the_likely_cause(tmp_path: Path, name: str) -> None:
         (["--unit", "h"], "unit = h: must be one of s, ms, us, ns"),
         (["--unit", "kg"], "--unit = kg: must be one of s, ms"),
         (["--within", "0.2"], "--within = 0.2: needs --offset"),
+        (["--taps", "--harp"], "--taps = true: goes without --harp"),
+        (["--taps", "--out", "c.csv"], "--out = c.csv: needs --map"),
     ],
 )
 def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) -> None:
@@ -306,6 +313,43 @@ def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) 
     done = here("align", tmp_path / "a.csv", tmp_path / "b.csv", *options)
     assert done.returncode == 2
     assert text in done.stderr
+
+
+def test_times_beyond_the_events_are_counted_and_an_older_file_is_kept(tmp_path: Path) -> None:
+    taps = np.cumsum(np.random.default_rng(RNG).uniform(0.5, 1.5, 40))
+    _write(tmp_path / "a.csv", "t", taps)
+    _write(tmp_path / "b.csv", "t", taps + 7.0)
+    _write(tmp_path / "asked.csv", "t", [taps[3], 1e6])
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    more = ("--map", tmp_path / "asked.csv", "--out", tmp_path / "out.csv")
+    made = answer("align", *files, *more)
+    assert (made["times"], made["unknown"], made["beyond_events"]) == (2, 0, 1)
+    written = (tmp_path / "out.csv").read_bytes()
+    done = here("align", *files, *more)
+    assert done.returncode == 2
+    assert "exists already" in done.stderr
+    assert (tmp_path / "out.csv").read_bytes() == written
+
+
+def test_taps_in_two_signals_align_their_clocks(tmp_path: Path) -> None:
+    rng, taps = np.random.default_rng(RNG), np.array([2.0, 7.5])
+    for name, rate, offset in (("a", 400.0, 0.0), ("b", 1000.0, -3.25)):
+        t = np.arange(0, 10, 1 / rate)
+        since = t[:, None] - taps
+        force = 80 * np.where(since >= 0, np.exp(-np.abs(since) / 0.02), 0).sum(axis=1)
+        values = force + rng.normal(0, 0.1, t.size)
+        rows = (f"{1e3 * (at + offset):.4f},{x:.4f}" for at, x in zip(t, values, strict=True))
+        (tmp_path / f"{name}.csv").write_text("\n".join(["time_ms,force_n", *rows]))
+    found = answer("align", tmp_path / "a.csv", tmp_path / "b.csv", "--taps")
+    assert (found["paired_by"], found["taps"]) == ("taps", 2)
+    assert abs(found["offset_ns"] + 3.25e9) <= found["half_ns"] < 6e6
+    by_array = sliplab.align_taps((t + 100.0, values), (t - 3.25, values))
+    mapped = by_array.map([107.5])
+    assert mapped.low_ns[0] <= round((7.5 - 3.25) * 1e9) <= mapped.high_ns[0]
+    with pytest.raises(AlignmentRefused, match="no clear tap"):
+        sliplab.align_taps((t, rng.normal(size=t.size)), (t, values))
+    with pytest.raises(InputError, match="finite"):
+        sliplab.align_taps((t, np.where(t > 5, np.nan, values)), (t, values))
 
 
 def _write(path: Path, name: str, values: Any) -> None:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import socket
 import struct
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sliplab.plugins.record.columns import ColumnsSettings
+from sliplab.plugins.record.columns_fake import FakeColumns
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import Source, columns
 from sliplab.protocols.errors import InputError
@@ -59,18 +57,13 @@ def recorded(folder: Path, source: Source, send: Callable[[int], object]) -> Rec
 
 def test_lines_of_a_serial_port_are_timed_by_arrival_and_wrong_ones_counted(tmp_path: Path) -> None:
     pytest.importorskip("serial")
-    here, there = pty.openpty()
-    tty.setraw(there)
-    source = columns("glove", os.ttyname(there), {"force": "N", "-": "", "angle": "deg"})
-    try:
+    known = {"force": "N", "-": "", "angle": "deg"}
+    with closing(FakeColumns(ColumnsSettings(place="-", columns=known))) as line:
         found = recorded(
             tmp_path,
-            source,
-            lambda i: os.write(here, b"junk\n" if i % 10 == 3 else b"%d,x1,%g\n" % (i, i / 2)),
+            columns("glove", line.address, known),
+            lambda i: line.write(b"junk\n" if i % 10 == 3 else b"%d,x1,%g\n" % (i, i / 2)),
         )
-    finally:
-        os.close(here)
-        os.close(there)
     rows = found.samples("glove")
     np.testing.assert_array_equal(rows["angle"], rows["force"] / 2)
     assert (np.diff(rows["force"]) > 0).all()

@@ -70,7 +70,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
         reported.append((train, sent, time.monotonic_ns()))
 
     with FakeSyncBox(on_train=on_train) as wire:
-        box = SerialSyncBox(SyncBoxSettings(port=wire.port))
+        box = SerialSyncBox(SyncBoxSettings(port=wire.address))
         box.start(200.0, 99, code)
         until(lambda: wire.pulses >= 20, 5.0)
         box.stop()
@@ -93,7 +93,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
 def test_an_unplugged_box_ticks_no_more() -> None:
     reported: list[PulseTrain | None] = []
     wire = FakeSyncBox(on_train=lambda train, sent: reported.append(train))
-    box = SerialSyncBox(SyncBoxSettings(port=wire.port))
+    box = SerialSyncBox(SyncBoxSettings(port=wire.address))
     box.start(100.0, 5)
     wire.close()
     wire.close()

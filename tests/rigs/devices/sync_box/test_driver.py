@@ -46,7 +46,7 @@ def box(wire: FakeSyncBox) -> Iterator[SerialSyncBox]:
 
 
 def settings(wire: FakeSyncBox) -> SyncBoxSettings:
-    return SyncBoxSettings(port=wire.port, answer_s=ANSWER_S, boot_s=1.0, silence_s=SILENCE_S)
+    return SyncBoxSettings(port=wire.address, answer_s=ANSWER_S, boot_s=1.0, silence_s=SILENCE_S)
 
 
 def gather(read: Callable[[], np.ndarray], done: Callable[[np.ndarray], bool]) -> np.ndarray:
@@ -164,8 +164,7 @@ def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box
 
 def test_a_reset_whose_word_is_lost_is_silence(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
-    wire.corrupt(1)
-    wire.reset()
+    wire.reset(told=False)
     assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
 
 
@@ -309,7 +308,7 @@ def test_what_the_box_refuses_is_said(wire: FakeSyncBox, box: Any, monkeypatch: 
     ],
 )
 def test_the_stand_in_survives_nonsense(wire: FakeSyncBox, box: SerialSyncBox, line: bytes) -> None:
-    with serial.Serial(wire.port, timeout=1.0) as port:
+    with serial.Serial(wire.address, timeout=1.0) as port:
         port.write(line)
         assert port.readline().startswith(b"E ")
     box.connect()

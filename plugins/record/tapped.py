@@ -1,0 +1,92 @@
+"""The clock of a recorded sensor by taps that another one felt, where that is known closer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sliplab.analysis.clocks.pulse_match import NoMatchError
+from sliplab.analysis.clocks.synchronise import HOST_PPM
+from sliplab.analysis.clocks.taps import Taps, find_taps, map_by_taps
+from sliplab.plugins.record.sources import READS, TIMING, Source, SourceAbout
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.timing import StreamTiming
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.schema.trial import DeviceRecord
+from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
+
+if TYPE_CHECKING:
+    from sliplab.storage.trials.hdf5_reader import StreamReader
+
+TAP = "tap"
+"""Name of marks that say when both were tapped."""
+NEAR_NS = 1_000_000_000
+"""Time on either side of such a mark in which taps are looked for."""
+
+
+def check_tap(tap: tuple[str, str], sources: Iterable[Source]) -> None:
+    """Raise InputError unless the first of two sensors has a clock of its own."""
+    known = {source.name: source for source in sources if not source.stream.about.of_camera}
+    for name in tap:
+        if name not in known or tap[0] == tap[1]:
+            text = f"must be two sensors of {', '.join(known) or 'which there are none'}"
+            raise InputError("tap", "", ", ".join(tap), text)
+    timing = known[tap[0]].stream.about.timing or StreamTiming()
+    own = known[tap[0]].clock == TIMING and timing.grade == "host time"
+    if not own and known[tap[0]].clock != READS:
+        text = "has no clock of its own that taps could align; name it second"
+        raise InputError("tap", "", tap[0], text)
+
+
+def clock_by_taps(
+    reader: StreamReader,
+    tap: tuple[str, str],
+    about: SourceAbout,
+    known: dict[str, DeviceRecord],
+    marks_ns: Iterable[int],
+) -> DeviceRecord:
+    """Return the clock of the first of two sensors.
+
+    Args:
+        known: clocks by other means, of both.
+        marks_ns: moments on the host's clock near which both were tapped; none: anywhere.
+
+    Raises:
+        NoMatchError: there is no clear tap, or it contradicts what is known by other means.
+    """
+    first, second = known[tap[0]], known[tap[1]]
+    own_ns, own = _taps(reader, tap[0], marks_ns)
+    _, other = _taps(reader, tap[1], marks_ns)
+    error = round(second.uncertainty_ns or 0)
+    there = (second.map.to_reference(each) for each in (other.low_ns, other.high_ns))
+    low, high = there
+    timing = about.record.timing or StreamTiming()
+    found = map_by_taps(own, Taps(low - error, high + error), timing.drift_ppm + HOST_PPM)
+    ends = np.array([own_ns[0], own_ns[-1]])
+    least, most = found.bounds(ends)
+    middle, half = least + (most - least) // 2, float((most - least).max()) / 2 + 1
+    off = np.abs(middle - first.map.to_reference(ends)).max()
+    if off > half + (first.uncertainty_ns or 0):
+        raise NoMatchError(
+            "no_match",
+            f"by taps it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
+        )
+    if half >= (first.uncertainty_ns or np.inf):
+        return first
+    line: Any = ClockMap.through(ends.tolist(), middle.tolist())
+    return DeviceRecord(
+        grade=TAP, kind="hard bound", map=line, uncertainty_ns=half, pairs=found.taps
+    )
+
+
+def _taps(reader: StreamReader, name: str, marks_ns: Iterable[int]) -> tuple[Any, Taps]:
+    """Return a stream's times, and the taps in it."""
+    group = f"{STREAM_GROUP}/{name}"
+    columns = [part for part in reader.stream_counts()[name] if part not in {"t", "host", "stamp"}]
+    t_ns, host = reader.column(f"{group}/t"), reader.column(f"{group}/host")
+    windows = [np.abs(host - mark) <= NEAR_NS for mark in marks_ns]
+    part = np.any(windows, axis=0) if windows else slice(None)
+    values = np.column_stack([reader.column(f"{group}/{each}")[part] for each in columns])
+    return t_ns, find_taps(name, t_ns[part], values)
