@@ -58,9 +58,9 @@ def waits_ms(drawn: SceneDraw, asked: Sequence[float]) -> list[float]:
     loads: list[_Loads] = []
     taken = take(drawn, lambda world: loads.append(_Loads(world)))
     world, truth = taken.devices.world, taken.truth
-    onsets = [math.inf if t is None else t for t in truth["slip_per_papilla_ns"]]
-    tip, box = int(np.argmin(onsets)), taken.devices.sync.clock
-    slip_ns = int(box.to_device(min(onsets)))
+    onsets = truth["slip_per_papilla_ns"]
+    first_ns, tip = min((t, tip) for tip, t in enumerate(onsets) if t is not None)
+    slip_ns = int(taken.devices.sync.clock.to_device(first_ns))
     t_ns, with_slip = loads[0].table.between(
         slip_ns - BEFORE * STEP_NS, slip_ns + (AFTER + 1) * STEP_NS
     )

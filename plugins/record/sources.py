@@ -161,9 +161,9 @@ class Source:
     def _clock_reads(self, seen: _Newest, now: int) -> Chunk:
         """Return readings of the clock since the last call, a chunk of the kind `CLOCK`."""
         if hasattr(self.device, "clock_reads"):
-            found: Chunk = self.device.clock_reads()
-            return found
-        found = []
+            own: Chunk = self.device.clock_reads()
+            return own
+        found: list[tuple[int, int, int, int]] = []
         if seen.newest_ns is not None:
             timing = self.stream.about.timing or StreamTiming()
             error = round(self.uncertainty_ns or 0)
@@ -417,7 +417,8 @@ def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
     by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
     locks = driver.locks(stream.device)
     if (shared := getattr(stream.device, "shared_clock", None)) is not None:
-        return Source(made, shared, stream.device.uncertainty_ms * 1e6, locks=locks)
+        stated_ms: float = getattr(stream.device, "uncertainty_ms", 0.0)
+        return Source(made, shared, stated_ms * 1e6, locks=locks)
     return Source(made, READS if by_reads else TIMING, locks=locks)
 
 
