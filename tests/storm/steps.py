@@ -33,6 +33,7 @@ from sliplab.protocols import Trial
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.rig import StopRequested
+from sliplab.rigs.rig_file import rig_hash
 from sliplab.storage.errors import StoreError
 from sliplab.storage.remote import pull as pulling
 from sliplab.storage.remote.objects import Remote, RemoteError
@@ -74,7 +75,9 @@ class Stage:
     @cached_property
     def calm(self) -> RunRequest:
         """The request to collect on a rig without faults; read once, for all processes."""
-        return self.request([])
+        request = self.request([])
+        rig_hash(request.rig_text)  # keeps the text's nodes for all processes, too
+        return request
 
     @cached_property
     def trials(self) -> tuple[str, ...]:

@@ -75,7 +75,10 @@ ALONE = {"mains_light", "arm_ramp"}
 def draw(seed: int) -> Story:
     """Return the story of a seed."""
     rng = random.Random(seed)
-    story = {"seed": seed, "protocol": _protocol(rng), "rig": _rig(rng)}
+    rig = _rig(rng)
+    # with a force limit, which is looked at all the time, a second costs six times as much
+    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 0.5, 5, 60])
+    story = {"seed": seed, "protocol": _protocol(rng, hold_s), "rig": rig}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
     steps: list[Step] = []
@@ -92,7 +95,7 @@ def draw(seed: int) -> Story:
     return {**story, "steps": steps}
 
 
-def _protocol(rng: random.Random) -> dict[str, Any]:
+def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
     data = protocol(rng.randint(3, 6))
     data["name"] = "storm"
     collection = data["collection"]
@@ -101,8 +104,9 @@ def _protocol(rng: random.Random) -> dict[str, Any]:
     factors["depth"]["values"] = [rng.choice([2.0, 2.4, 3.2])]
     factors["speed"]["values"] = [rng.choice([0.4, 0.4, 1.6, 4.0])]
     collection["motion"][3]["distance"] = f"{rng.choice([1.6, 4, 8])} mm"
-    settle, hold = rng.choice([0.2, 10]), rng.choice([0.5, 5])
-    collection["motion"][2] |= {"settle": f"{settle} s", "duration": f"{hold} s"}
+    settle_s = rng.choice([0.2, 10])
+    collection["motion"][2] |= {"settle": f"{settle_s} s", "duration": f"{hold_s} s"}
+    collection["limits"] = {**collection.get("limits", {}), "duration": "300 s"}
     collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0036 ms"])
     collection["gates"]["retakes"] = rng.choice([0, 2])
     warm_up = {"presses": 2, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
