@@ -70,7 +70,7 @@ class Ledger:
         self.errors: list[tuple[str, float]] = []
         self.trials: dict[str, Sums] = {}
         self.aside: dict[str, Sums] = {}
-        self.imported: dict[str, Sums] = {}
+        self.others: dict[str, Sums] = {}
         self.files: Sums = {}
         self.damaged: dict[str, tuple[str, Sums]] = {}
         self.owed: set[str] = set()
@@ -104,7 +104,7 @@ class Ledger:
             self._check_trials(aside)
             self._check_references(before, notes)
             self._check_recorded(notes, ended)
-            self._check_imported(notes)
+            self._check_others(notes)
             self._check_copies(notes)
             self._check_journals()
             self._check_status()
@@ -288,17 +288,31 @@ class Ledger:
         """Return whether a trial was committed with the data that it had unfinished."""
         return "data.h5" in sums and self.trials.get(name, {}).get("data.h5") == sums["data.h5"]
 
-    def _check_imported(self, notes: list[dict[str, Any]]) -> None:
-        folder = self._folder / "campaigns" / "copied" / "trials"
-        now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
-        reported = {note["imported"] for note in notes if "imported" in note}
-        for name in self.imported.keys() | reported:
-            if name not in now or self.imported.get(name, now[name]) != now[name]:
-                raise Wrong("nothing committed is lost or changed", f"copied/{name}")
-        for name in now.keys() - self.imported.keys():
-            for problem in verify_trial(folder / name):
-                raise Wrong("what is committed is whole", f"copied/{name}: {problem.what}")
-        self.imported = now
+    def _check_others(self, notes: list[dict[str, Any]]) -> None:
+        """Trials of other campaigns: imported, or recorded without a protocol."""
+        now: dict[str, Sums] = {}
+        for path in sorted(self._folder.glob("campaigns/*/trials/*")):
+            if (campaign := path.parent.parent.name) != NAME:
+                now[f"{campaign}/{path.name}"] = self._sums(path)
+        reported = {note["kept"]: note for note in notes if "kept" in note}
+        for name in self.others.keys() | reported.keys():
+            if name not in now or self.others.get(name, now[name]) != now[name]:
+                raise Wrong("nothing committed is lost or changed", name)
+        for name in now.keys() - self.others.keys():
+            campaign, _, trial = name.partition("/")
+            folder = self._folder / "campaigns" / campaign / "trials" / trial
+            for problem in verify_trial(folder):
+                raise Wrong("what is committed is whole", f"{name}: {problem.what}")
+            recording, note = Recording(folder), reported.get(name, {})
+            if not recording.record.simulated:
+                raise Wrong("nothing simulated is unmarked", name)
+            if "rows" in note:
+                with recording.open() as reader:
+                    found = reader.column("streams/grip/value")
+                sent = np.arange(note["first"], note["first"] + note["rows"])
+                if not np.array_equal(found, sent):
+                    raise Wrong("what was sent is stored", f"{name}: {len(found)} of {len(sent)}")
+        self.others = now
 
     def _check_copies(self, notes: list[dict[str, Any]]) -> None:
         """What the remote store shows is there in whole; what was pulled is a trial of ours."""

@@ -197,7 +197,9 @@ class Player:
             if "wrong" in note:
                 raise Wrong(note["wrong"], note["what"])
         weather = step.get("weather", {})
-        lies = any("lie" in event for event in step.get("events", ()))
+        events = step.get("events", ())
+        lies = any("lie" in event for event in events)
+        late = any("suspend" in event for event in events)
         if how == "killed" and not ({"kill", "power"} & weather.keys() and end.killed):
             raise Wrong("errors are explained", f"ended with {end.code}: {end.said[-300:]}")
         why = {
@@ -206,11 +208,12 @@ class Player:
             "stopped": any("signal" in n or n.get("asked") == "stop" for n in notes),
             "CampaignStopped": bool("low" in weather or "paused" in text or "drifted" in text),
             "WindowOver": "window_s" in step,
-            "RigError": bool(step.get("faults") or weather or lies),
+            "RigError": bool(step.get("faults") or weather or lies or late),
+            "SafeState": bool(step.get("faults")),
             "ForceLimitError": bool(step.get("faults") or lies),
             "ArmFault": bool(step.get("faults") or lies),
             "GuardError": bool(step.get("faults") or lies),
-            "StoreError": bool(weather) or _has(step, "disk_full"),
+            "StoreError": bool(weather or self._ledger.damaged) or _has(step, "disk_full"),
             "OSError": bool(weather),
             "RemoteError": bool(step.get("fails") or weather or self._ledger.spoilt),
             "RemoteDamaged": bool(step.get("short") or self._ledger.spoilt),
