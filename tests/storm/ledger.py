@@ -77,6 +77,7 @@ class Ledger:
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
         self.again: Counter[str] = Counter()
+        self.failed: Counter[str] = Counter()
         self.logged: list[str] = []
         self.asked: dict[int, str] = {}
         self._known: dict[tuple[Any, ...], str] = {}
@@ -269,7 +270,13 @@ class Ledger:
         self.unfinished = {name: self._sums(folder / name) for name in incoming}
         self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
         self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
-        failed = Counter(
+        forgiven = any("again" in note.values() for note in notes)
+        for note in notes:
+            count = self.failed[note.get("begins", "")]
+            if count > self._retakes and not forgiven:
+                what = f"{note['begins']} begins again, it failed {count} times"
+                raise Wrong("a failed trial is retaken as often as planned", what)
+        failed = self.failed = Counter(
             item["trial"]
             for item in Campaign(self._campaign).quarantined()
             if str(item["cause"]).startswith("gate") and FORGIVEN not in item
@@ -339,6 +346,9 @@ class Ledger:
                 for name, sums in self.trials.items():
                     if name not in self.damaged and shown.get(name) != sums:
                         raise Wrong("what is reported is done", f"{name} was not pushed")
+                    bad = self.spoilt & {*sums.values()} if note["check"] else set()
+                    if name not in self.damaged and bad:
+                        raise Wrong("what is reported is done", f"{name} was not read back")
             if "pulled" in note and not note["problems"]:
                 for name in shown.keys() - now.keys():
                     raise Wrong("what is reported is done", f"{name} was not pulled")

@@ -199,6 +199,7 @@ class Player:
         weather = step.get("weather", {})
         events = step.get("events", ())
         lies = any("lie" in event for event in events)
+        filled = any("fill" in event for event in events)
         late = any("suspend" in event for event in events)
         if how == "killed" and not ({"kill", "power"} & weather.keys() and end.killed):
             raise Wrong("errors are explained", f"ended with {end.code}: {end.said[-300:]}")
@@ -206,7 +207,9 @@ class Player:
             "done": True,
             "killed": True,
             "stopped": any("signal" in n or n.get("asked") == "stop" for n in notes),
-            "CampaignStopped": bool("low" in weather or "paused" in text or "drifted" in text),
+            "CampaignStopped": bool(
+                "low" in weather or filled or "paused" in text or "drifted" in text
+            ),
             "WindowOver": "window_s" in step,
             "RigError": bool(step.get("faults") or weather or lies or late),
             "SafeState": bool(step.get("faults")),

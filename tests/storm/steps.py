@@ -228,6 +228,9 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
             os.kill(os.getpid(), getattr(signal, event["signal"]))
     elif "clock" in event:
         process.host.wall_s += event["clock"]
+    elif "fill" in event:
+        process.host.free = event["fill"]
+        process.notes.add(filled=event["fill"])
     elif "suspend" in event:
         witness.suspend(event["suspend"])
     elif "lie" in event:
@@ -241,7 +244,7 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
     else:
         try:
             if "log" in event:
-                _log(process, event["log"])
+                witness.skin_logged = _log(process, event["log"]) or witness.skin_logged
             else:
                 _file_request(process, event)
         except (OSError, StoreError, InputError) as error:
@@ -287,14 +290,16 @@ def log(process: Process, step: dict[str, Any]) -> None:
         _log(process, step)
 
 
-def _log(process: Process, step: dict[str, Any]) -> None:
+def _log(process: Process, step: dict[str, Any]) -> bool:
+    """Log a note, or a skin; return whether it is a skin."""
     store = Store.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
-        return
+        return False
     add_note(store, text, who="anna", context=context)
     process.notes.add(logged=text, **(context or {}))
+    return context is not None
 
 
 def check(process: Process, step: dict[str, Any]) -> None:

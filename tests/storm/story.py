@@ -212,9 +212,10 @@ def _event(rng: random.Random, story: Story, trials: int, night_s: float) -> Ste
         {"clock": rng.choice([-7200, -3, 40, 90_000])},
         {"rival": True},
         {"suspend": rng.choice([0.3, 5.0, 600.0])},
+        {"fill": rng.choice([0, RESERVE + 2000, RESERVE + 20_000])},
         _lie(rng, story),
     ]
-    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 4])[0]
+    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 4])[0]
     return {"at_s": round(rng.uniform(0, 1.1 * night_s), 2), **made}
 
 
@@ -228,6 +229,10 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
     most = rng.choice([None, None, None, 1, 2])  # so that later nights have trials left
     night_s = (most or trials) * _trial_s(story)
     events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3]))]
+    for event in [each for each in events if each.get("ask") == "pause"]:
+        if rng.random() < 0.6:  # who pauses goes on again, mostly
+            end_s = round(event["at_s"] + rng.uniform(0, 3 * night_s), 2)
+            events.append({"at_s": end_s, "ask": "resume"})
     window = {"window_s": round(rng.uniform(0, 1.2 * night_s), 1)} if rng.random() < 0.15 else {}
     return {
         "faults": _faults(rng, story),

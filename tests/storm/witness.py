@@ -33,6 +33,8 @@ STUCK_S, STUCK_MM = 3.0, 0.5
 """Time, and motion at the commanded speed, until a pose that does not change stops the arm."""
 SILENT_S = 0.5
 """Until a force sensor that does not answer has stopped the arm."""
+RATES_HZ = {"frames/t": 100.0, "poses/t": 500.0}
+"""Rows a second while streams run, of those that nobody changes."""
 FORCE_SHARE = 1.1
 """Times its limit that a true force may be, for noise, and until the next sample."""
 ZERO_MM = 0.15
@@ -51,7 +53,7 @@ class Witness:
         calm: no fault of a device disturbs where the arm is.
 
     Attributes:
-        resumed: a pause has ended, and depth zero was not found since.
+        resumed: a pause has ended, or another skin was logged, and depth zero not found since.
         lie: what a device reports that is not so.
     """
 
@@ -59,6 +61,7 @@ class Witness:
         limits = file.limits
         self._calm = calm
         self.lie = Lie(lambda: host.passed_s)
+        self._lied = ""
         self._lied_s: float | None = None
         self._segment: Segment | None = None
         self._misled = False
@@ -68,11 +71,11 @@ class Witness:
         self._forced_s: float | None = None
         self._depth_mm, self._reach_mm = float(limits.depth), float(limits.reach)
         self._speed_mm_s, self._poll_s = float(limits.speed), float(file.poll)
-        self._host, self._notes = host, notes
+        self._host, self._notes, self._streams_s = host, notes, 0.0
         self._asked_s: float | None = None
         self._starts = 0
         self._outside: tuple[float, float] | None = None
-        self.resumed = False
+        self.resumed = self.skin_logged = False
         self._rezeroes = False
 
     def wrong(self, invariant: str, what: str) -> None:
@@ -122,6 +125,8 @@ class Witness:
         run_trial: Any = Rig.run_trial
         rezero: Any = Rig.rezero
         take_step: Any = Rig.take_step
+        start_streams: Any = Rig.start_streams
+        stop_streams: Any = Rig.stop_streams
         self.lie.install()
         self._pass_time = pass_time
 
@@ -152,9 +157,21 @@ class Witness:
             self._look_at_step(rig, step, at, self._host.passed_s - began_s)
             return times
 
+        def starting_streams(rig: Rig, *given: Any, **named: Any) -> None:
+            start_streams(rig, *given, **named)
+            self._streams_s = self._host.passed_s
+
+        def stopping_streams(rig: Rig, sink: Any) -> None:
+            took_s = self._host.passed_s - self._streams_s
+            stop_streams(rig, sink)
+            for name, rate_hz in RATES_HZ.items() if isinstance(sink, Tee) and self._calm else ():
+                rows = sink.columns[name][0]
+                if not rows >= rate_hz * took_s - 2:
+                    self.wrong("what happened is recorded", f"{rows} rows of {name} in {took_s} s")
+
         def running(rig: Rig, program: Any, sink: Any, *more: Any, **named: Any) -> Any:
             if self.resumed and self._rezeroes:
-                self.wrong("a pause may change the rig", "depth zero is not found again after one")
+                self.wrong("pauses and skins change the rig", "depth zero is not found again")
             self.resumed = False
             tee = Tee(sink)
             done = run_trial(rig, program, tee, *more, **named)
@@ -165,6 +182,8 @@ class Witness:
         SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
         Rig.run_trial = running  # type: ignore[method-assign]
         Rig.rezero = rezeroing  # type: ignore[method-assign]
+        Rig.start_streams = starting_streams  # type: ignore[method-assign]
+        Rig.stop_streams = stopping_streams  # type: ignore[method-assign]
         Rig.take_step = stepping  # type: ignore[method-assign]
 
     def watch(self, supervisor: CollectionSupervisor, plan: Plan) -> None:
@@ -187,6 +206,8 @@ class Witness:
                 self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
             if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
                 self.wrong("requests are carried out", "continues in spite of a stop")
+            if self.skin_logged:
+                self.resumed, self.skin_logged = True, False
             if until is not None and self._host.wall_s > until:
                 self.wrong("no trial begins outside its window", trial.id)
             folders = campaign.folders("trials")
@@ -254,8 +275,8 @@ class Witness:
         if not (kind and moving and segment) or (kind == "pose_away" and self._misled):
             self._lied_s = None
             return
-        if self._lied_s is None:
-            self._lied_s = now_s
+        if self._lied_s is None or kind != self._lied:
+            self._lied, self._lied_s = kind, now_s
         bound_s = self._poll_s + SLACK_S
         if kind == "pose_frozen":
             frozen = self.lie.frozen
@@ -264,7 +285,8 @@ class Witness:
             bound_s += STUCK_S + STUCK_MM / segment.speed_mm_s + self._poll_s
         elif kind.startswith("force"):
             there = world.plane.sensor(segment.to)
-            if math.dist(place[:2], there[:2]) < 0.5 and there[2] < place[2]:
+            straight = self._misled or math.dist(place[:2], there[:2]) < 0.5
+            if straight and there[2] < place[2]:
                 return  # it leaves the plate, whatever the sensor says
             bound_s = SILENT_S
         if now_s - self._lied_s > bound_s:
