@@ -64,7 +64,7 @@ class Ledger:
         self._skin = request.rig.skin.serial
         self._skins: dict[str, str] = {}
         self._sent: dict[str, dict[str, Column]] = {}
-        self._takes: dict[str, list[Sums]] = {}
+        self.takes: dict[str, list[Sums]] = {}
         self._pulled: dict[str, Sums] = {}
         self.spoilt: set[str] = set()
         self.errors: list[tuple[str, float]] = []
@@ -185,7 +185,7 @@ class Ledger:
                     self.damaged[name] = how, now[name]
                     continue
             self._check_new(name, aside)
-            self._takes.setdefault(name, []).append(now[name])
+            self.takes.setdefault(name, []).append(now[name])
         self.trials = {name: now[name] for name in now.keys() - moving}
         self.damaged = {name: how for name, how in self.damaged.items() if name in self.trials}
 
@@ -338,7 +338,7 @@ class Ledger:
         folder = self._folder.parent / "pulled" / "campaigns" / NAME / "trials"
         now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
         for name, sums in now.items():
-            if self._pulled.get(name) != sums and sums not in self._takes.get(name, ()):
+            if self._pulled.get(name) != sums and sums not in self.takes.get(name, ()):
                 raise Wrong("what is pulled is whole", name)
         self._pulled = now
         for note in notes:
