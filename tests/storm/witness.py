@@ -103,7 +103,8 @@ class Witness:
 
         def reacting_to(rig: Rig, phase: str, reflex: Reflex, *given: Any) -> Any:
             made = react(rig, phase, reflex, *given)
-            world = _world(rig)
+            world = self._world
+            assert world is not None
             if world.path.moving(world.now_ns):
                 self.wrong("a reflex stops the arm", f"it still moves after a {reflex.kind}")
             depth_mm = float(world.path.states(np.array([world.now_ns], np.int64))[0][8])
@@ -220,9 +221,11 @@ class Witness:
 
     def _look_at_zero(self, rig: Rig) -> None:
         """Hold depth zero, which was just found, against the true plate."""
+        if not self._calm:  # a fault's arm stands before the simulated one
+            return
         pose = rig.plate_frame.pose(Position(0.0, 0.0, 0.0))
         off = float(_world(rig).plane.sensor(pose)[2])
-        if self._calm and not abs(off) <= ZERO_MM:
+        if not abs(off) <= ZERO_MM:
             self.wrong("depth zero is the plate", f"it is {off:.3f} mm off")
 
     def _look_at_step(self, rig: Rig, step: Any, at: Position, took_s: float) -> None:
