@@ -48,6 +48,17 @@ def story_file(text: str) -> dict[str, Any]:
     return found
 
 
+def plants(text: str) -> list[str]:
+    """Read names of planted defects, with commas between them; all of them for `all`."""
+    from tests.storm.planted import PLANTS
+
+    names = [*PLANTS] if text == "all" else text.split(",")
+    if unknown := {*names} - {*PLANTS}:
+        known = ", ".join(PLANTS)
+        raise argparse.ArgumentTypeError(f"{', '.join(unknown)}: must be all, or of {known}")
+    return names
+
+
 def main() -> int:
     """Exit code 0 when every invariant held."""
     parser = argparse.ArgumentParser(
@@ -63,19 +74,19 @@ def main() -> int:
         "--jobs", type=count, default=1, help="processes, each with its share of seeds"
     )
     parser.add_argument("--story", type=story_file, help="play the story in this file")
-    parser.add_argument("--plant", help="play with a defect of tests/storm/planted.py, or `all`")
+    parser.add_argument(
+        "--plant",
+        type=plants,
+        default=[],
+        help="play with a defect of tests/storm/planted.py; with several, or `all`, one by one",
+    )
     parser.add_argument("--show", action="store_true", help="print stories and traces")
     parser.add_argument("--no-shrink", action="store_true", help="leave a failing story long")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--every", type=int, default=1, help=argparse.SUPPRESS)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     asked = parser.parse_args()
-    if asked.plant is not None:
-        from tests.storm.planted import PLANTS
-
-        if asked.plant not in ("all", *PLANTS):
-            parser.error(f"--plant {asked.plant}: must be all, or one of {', '.join(PLANTS)}")
-    if asked.plant == "all":
+    if len(asked.plant) > 1:
         result = _plants(asked)
     elif asked.jobs > 1:
         result = _jobs(asked)
@@ -91,8 +102,8 @@ def _play(asked: argparse.Namespace) -> dict[str, Any]:
     from tests.storm.story import draw
 
     warm()
-    if asked.plant:
-        PLANTS[asked.plant]()
+    for name in asked.plant:
+        PLANTS[name]()
     seed, began, rig_s, passed_s = asked.seed, time.monotonic(), 0.0, 0.0
     clocks = Clocks()
     failed: list[dict[str, Any]] = []
@@ -175,6 +186,7 @@ def _result(
         "hours_with_pauses": round(passed_s / 3600, 3),
         "minutes": round(took_s / 60, 2),
         "hours_an_hour": round(rig_s / took_s, 1),
+        "processor_s": round(_processor_s(), 1),
         "hours_a_processor_hour": round(rig_s / max(_processor_s(), 1e-9), 1),
         "hashes": hashes,
         "failed": failed,
@@ -192,7 +204,9 @@ def _words(result: dict[str, Any]) -> str:
     lines = [
         f"seed {it['seed']}: {it['wrong']}\n{json.dumps(it['story'])}" for it in result["failed"]
     ]
-    lines += [f"{name}: {found}" for name, found in result.get("plants", {}).items()]
+    if table := result.get("plants"):
+        lines = [f"{'name':20} {'found':6} {'seed':>7} {'processor':>9}  by"]
+        lines += [_row(found) for found in table]
     if "stories" in result:
         lines.append(
             f"{result['stories']} stories, {result['campaign_hours']:.2f} campaign hours "
@@ -241,22 +255,28 @@ def _jobs(asked: argparse.Namespace) -> dict[str, Any]:
 
 def _plants(asked: argparse.Namespace) -> dict[str, Any]:
     """Look for each planted defect by itself; `failed` are those that were not found."""
-    from tests.storm.planted import PLANTS
     from tests.storm.play import warm
 
     warm()
-    asked.no_shrink, found, missed = True, {}, []
+    asked.no_shrink, names, rows, missed = True, asked.plant, [], []
     asked.minutes = asked.minutes or 5.0
-    for name in PLANTS:
-        asked.plant = name
+    for name in names:
+        asked.plant = [name]
         part = _forked(asked)
         seen = part["failed"][0] if part["failed"] else None
-        said = None if seen is None else f"seed {seen['seed']}: {seen['wrong'][:120]}"
-        found[name] = {"stories": part["stories"], "minutes": part["minutes"], "found": said}
-        print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
+        row = {"name": name, "found": seen is not None, "processor_s": part["processor_s"]}
+        rows.append({**row, "seed": seen and seen["seed"], "by": seen and seen["wrong"][:90]})
+        print(_row(rows[-1]), file=sys.stderr, flush=True)
         if seen is None:
             missed.append({"seed": asked.seed, "wrong": f"{name} was not found", "story": None})
-    return {"plants": found, "failed": missed}
+    return {"plants": rows, "failed": missed}
+
+
+def _row(found: dict[str, Any]) -> str:
+    """Return a line of the table of planted defects."""
+    seed = "-" if found["seed"] is None else found["seed"]
+    state, by = ("found", found["by"]) if found["found"] else ("missed", "")
+    return f"{found['name']:20} {state:6} {seed:>7} {found['processor_s']:>7.1f} s  {by}"
 
 
 def _forked(asked: argparse.Namespace) -> dict[str, Any]:

@@ -64,19 +64,20 @@ class Ledger:
         self._skin = request.rig.skin.serial
         self._skins: dict[str, str] = {}
         self._sent: dict[str, dict[str, Column]] = {}
-        self._takes: dict[str, list[Sums]] = {}
+        self.takes: dict[str, list[Sums]] = {}
         self._pulled: dict[str, Sums] = {}
         self.spoilt: set[str] = set()
         self.errors: list[tuple[str, float]] = []
         self.trials: dict[str, Sums] = {}
         self.aside: dict[str, Sums] = {}
-        self.imported: dict[str, Sums] = {}
+        self.others: dict[str, Sums] = {}
         self.files: Sums = {}
         self.damaged: dict[str, tuple[str, Sums]] = {}
         self.owed: set[str] = set()
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
         self.again: Counter[str] = Counter()
+        self.failed: Counter[str] = Counter()
         self.logged: list[str] = []
         self.asked: dict[int, str] = {}
         self._known: dict[tuple[Any, ...], str] = {}
@@ -104,7 +105,7 @@ class Ledger:
             self._check_trials(aside)
             self._check_references(before, notes)
             self._check_recorded(notes, ended)
-            self._check_imported(notes)
+            self._check_others(notes)
             self._check_copies(notes)
             self._check_journals()
             self._check_status()
@@ -184,7 +185,7 @@ class Ledger:
                     self.damaged[name] = how, now[name]
                     continue
             self._check_new(name, aside)
-            self._takes.setdefault(name, []).append(now[name])
+            self.takes.setdefault(name, []).append(now[name])
         self.trials = {name: now[name] for name in now.keys() - moving}
         self.damaged = {name: how for name, how in self.damaged.items() if name in self.trials}
 
@@ -269,7 +270,13 @@ class Ledger:
         self.unfinished = {name: self._sums(folder / name) for name in incoming}
         self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
         self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
-        failed = Counter(
+        forgiven = any("again" in note.values() for note in notes)
+        for note in notes:
+            count = self.failed[note.get("begins", "")]
+            if count > self._retakes and not forgiven:
+                what = f"{note['begins']} begins again, it failed {count} times"
+                raise Wrong("a failed trial is retaken as often as planned", what)
+        failed = self.failed = Counter(
             item["trial"]
             for item in Campaign(self._campaign).quarantined()
             if str(item["cause"]).startswith("gate") and FORGIVEN not in item
@@ -288,17 +295,31 @@ class Ledger:
         """Return whether a trial was committed with the data that it had unfinished."""
         return "data.h5" in sums and self.trials.get(name, {}).get("data.h5") == sums["data.h5"]
 
-    def _check_imported(self, notes: list[dict[str, Any]]) -> None:
-        folder = self._folder / "campaigns" / "copied" / "trials"
-        now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
-        reported = {note["imported"] for note in notes if "imported" in note}
-        for name in self.imported.keys() | reported:
-            if name not in now or self.imported.get(name, now[name]) != now[name]:
-                raise Wrong("nothing committed is lost or changed", f"copied/{name}")
-        for name in now.keys() - self.imported.keys():
-            for problem in verify_trial(folder / name):
-                raise Wrong("what is committed is whole", f"copied/{name}: {problem.what}")
-        self.imported = now
+    def _check_others(self, notes: list[dict[str, Any]]) -> None:
+        """Trials of other campaigns: imported, or recorded without a protocol."""
+        now: dict[str, Sums] = {}
+        for path in sorted(self._folder.glob("campaigns/*/trials/*")):
+            if (campaign := path.parent.parent.name) != NAME:
+                now[f"{campaign}/{path.name}"] = self._sums(path)
+        reported = {note["kept"]: note for note in notes if "kept" in note}
+        for name in self.others.keys() | reported.keys():
+            if name not in now or self.others.get(name, now[name]) != now[name]:
+                raise Wrong("nothing committed is lost or changed", name)
+        for name in now.keys() - self.others.keys():
+            campaign, _, trial = name.partition("/")
+            folder = self._folder / "campaigns" / campaign / "trials" / trial
+            for problem in verify_trial(folder):
+                raise Wrong("what is committed is whole", f"{name}: {problem.what}")
+            recording, note = Recording(folder), reported.get(name, {})
+            if not recording.record.simulated:
+                raise Wrong("nothing simulated is unmarked", name)
+            if "rows" in note:
+                with recording.open() as reader:
+                    found = reader.column("streams/grip/value")
+                sent = np.arange(note["first"], note["first"] + note["rows"])
+                if not np.array_equal(found, sent):
+                    raise Wrong("what was sent is stored", f"{name}: {len(found)} of {len(sent)}")
+        self.others = now
 
     def _check_copies(self, notes: list[dict[str, Any]]) -> None:
         """What the remote store shows is there in whole; what was pulled is a trial of ours."""
@@ -317,7 +338,7 @@ class Ledger:
         folder = self._folder.parent / "pulled" / "campaigns" / NAME / "trials"
         now = {path.name: self._sums(path) for path in folder.iterdir()} if folder.is_dir() else {}
         for name, sums in now.items():
-            if self._pulled.get(name) != sums and sums not in self._takes.get(name, ()):
+            if self._pulled.get(name) != sums and sums not in self.takes.get(name, ()):
                 raise Wrong("what is pulled is whole", name)
         self._pulled = now
         for note in notes:
@@ -325,6 +346,9 @@ class Ledger:
                 for name, sums in self.trials.items():
                     if name not in self.damaged and shown.get(name) != sums:
                         raise Wrong("what is reported is done", f"{name} was not pushed")
+                    bad = self.spoilt & {*sums.values()} if note["check"] else set()
+                    if name not in self.damaged and bad:
+                        raise Wrong("what is reported is done", f"{name} was not read back")
             if "pulled" in note and not note["problems"]:
                 for name in shown.keys() - now.keys():
                     raise Wrong("what is reported is done", f"{name} was not pulled")

@@ -22,6 +22,7 @@ from sliplab.rigs.core.capabilities import ArmState
 from sliplab.storage import files
 from sliplab.storage.remote import objects, pull
 from sliplab.storage.remote import push as pushing
+from sliplab.storage.streams import NullSink
 from sliplab.storage.trials import checksums, control, journal, lock, recovery, store, writer
 
 PLANTS: dict[str, Callable[[], None]] = {}
@@ -430,3 +431,101 @@ def window_in_utc() -> None:
     """The end of a window is taken by the clock of Greenwich."""
     end = schedules.window_end
     schedules.window_end = lambda due, until, zone: end(due, until, "UTC")  # type: ignore[assignment]
+
+
+# -- a third set, of kinds that the two before do not have -----------------------------------------
+
+
+@plant
+def reach_unwatched() -> None:
+    """Places are held against the depth alone, on the plan and on the way."""
+    places = guard.Guard._places
+
+    def deep(self: guard.Guard, *given: Any) -> Any:
+        return (each for each in places(self, *given) if each.error is guard.DepthError)
+
+    guard.Guard._places = deep  # type: ignore[method-assign]
+
+
+@plant
+def zero_of_skin() -> None:
+    """Depth zero of the skin before is believed after another was logged."""
+    fresh = session.TrialCollector.fresh_start
+    was_paused = supervisor.CollectionSupervisor.was_paused
+    paused = [False]
+
+    def was(self: supervisor.CollectionSupervisor) -> bool:
+        paused[0] = was_paused(self)
+        return paused[0]
+
+    def only_paused(self: session.TrialCollector) -> None:
+        if paused[0]:
+            fresh(self)
+
+    supervisor.CollectionSupervisor.was_paused = was  # type: ignore[method-assign]
+    session.TrialCollector.fresh_start = only_paused  # type: ignore[method-assign]
+
+
+@plant
+def newest_first() -> None:
+    """Of requests that wait, the newest is carried out first."""
+    known = control.open_requests
+    control.open_requests = lambda where: known(where)[::-1]
+
+
+@plant
+def tail_lost() -> None:
+    """What devices still hold when their streams stop is not read."""
+    stop = rig.Rig.stop_streams
+
+    rig.Rig.stop_streams = lambda self, sink: stop(self, NullSink())  # type: ignore[method-assign]
+
+
+@plant
+def rate_short() -> None:
+    """A clock's rate is taken for nine tenths of what it was found to be."""
+    made = synchronise.DeviceSync.record
+
+    def slower(self: synchronise.DeviceSync) -> Any:
+        known = self.map
+        if len(known.drift) == 1:
+            known = replace(known, drift=(round(0.9 * known.drift[0]),))
+        return made(replace(self, map=known))
+
+    synchronise.DeviceSync.record = slower  # type: ignore[method-assign]
+
+
+@plant
+def free_once() -> None:
+    """The room on the disk is read before the first trial, and believed from then on."""
+    made = watches.DiskWatch.__init__
+
+    def once(self: watches.DiskWatch, *given: Any, **named: Any) -> None:
+        made(self, *given, **named)
+        free, known = self._free, list[int]()
+
+        def first(folder: Path) -> int:
+            if not known:
+                known.append(free(folder))
+            return known[0]
+
+        self._free = first
+
+    watches.DiskWatch.__init__ = once  # type: ignore[method-assign]
+
+
+@plant
+def end_guessed() -> None:
+    """A run that was to be cancelled is closed as cancelled, however it ended."""
+    close = runs.ServedRuns._close
+
+    async def guessing(self: runs.ServedRuns, client: Any, *, cancelled: bool) -> None:
+        end_of = runs.run_records.end_of
+        if cancelled:
+            runs.run_records.end_of = lambda *given: None  # type: ignore[assignment]
+        try:
+            await close(self, client, cancelled=cancelled)
+        finally:
+            runs.run_records.end_of = end_of
+
+    runs.ServedRuns._close = guessing  # type: ignore[method-assign]

@@ -12,6 +12,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sliplab.flows.cli.errors import failure
@@ -24,15 +25,23 @@ from sliplab.flows.collecting.requests import (
 )
 from sliplab.flows.collecting.session import open_session, refresh
 from sliplab.flows.collecting.supervisor import SessionListener, WindowOver
+from sliplab.flows.detect import detect
+from sliplab.flows.detecting.request import make_detect_request
+from sliplab.flows.detecting.sources import named_source
+from sliplab.flows.exports import ExportRequest, export
 from sliplab.flows.imports import import_data
 from sliplab.flows.log import add_note
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import stopping
 from sliplab.flows.verify import verify
+from sliplab.plugins.record.recorder import record
+from sliplab.plugins.record.sources import push as pushed
 from sliplab.protocols import Trial
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.program import ACTING
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.rig import StopRequested
+from sliplab.rigs.rig_file import rig_hash
 from sliplab.storage.errors import StoreError
 from sliplab.storage.remote import pull as pulling
 from sliplab.storage.remote.objects import Remote, RemoteError
@@ -74,7 +83,9 @@ class Stage:
     @cached_property
     def calm(self) -> RunRequest:
         """The request to collect on a rig without faults; read once, for all processes."""
-        return self.request([])
+        request = self.request([])
+        rig_hash(request.rig_text)  # keeps the text's nodes for all processes, too
+        return request
 
     @cached_property
     def trials(self) -> tuple[str, ...]:
@@ -174,8 +185,8 @@ def night(process: Process, step: dict[str, Any]) -> None:
     host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
     # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces
     supervising.POLL_S, force_watch.POLL_S = 300.0, 0.1
-    lies = any("lie" in event for event in step.get("events", ()))
-    witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or lies))
+    disturbed = any({"lie", "suspend"} & event.keys() for event in step.get("events", ()))
+    witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or disturbed))
     witness.install()
     host.events = [
         (event["at_s"], partial(happen, process, event, witness))
@@ -217,6 +228,11 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
             os.kill(os.getpid(), getattr(signal, event["signal"]))
     elif "clock" in event:
         process.host.wall_s += event["clock"]
+    elif "fill" in event:
+        process.host.free = event["fill"]
+        process.notes.add(filled=event["fill"])
+    elif "suspend" in event:
+        witness.suspend(event["suspend"])
     elif "lie" in event:
         witness.lie.begin(event["lie"], event["seconds"])
     elif "rival" in event:
@@ -228,7 +244,7 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
     else:
         try:
             if "log" in event:
-                _log(process, event["log"])
+                witness.skin_logged = _log(process, event["log"]) or witness.skin_logged
             else:
                 _file_request(process, event)
         except (OSError, StoreError, InputError) as error:
@@ -274,14 +290,16 @@ def log(process: Process, step: dict[str, Any]) -> None:
         _log(process, step)
 
 
-def _log(process: Process, step: dict[str, Any]) -> None:
+def _log(process: Process, step: dict[str, Any]) -> bool:
+    """Log a note, or a skin; return whether it is a skin."""
     store = Store.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
-        return
+        return False
     add_note(store, text, who="anna", context=context)
     process.notes.add(logged=text, **(context or {}))
+    return context is not None
 
 
 def check(process: Process, step: dict[str, Any]) -> None:
@@ -333,7 +351,78 @@ def bring(process: Process, step: dict[str, Any]) -> None:
             return
         shutil.copy(trials[0] / "data.h5", file)
     import_data(file, process.stage.store, name="copied", simulated=True)
-    process.notes.add(imported="one")
+    process.notes.add(kept="copied/one")
+
+
+def take_down(process: Process, step: dict[str, Any]) -> None:
+    """Record numbers beside a program of its own, which may fail in the middle of a trial."""
+    first = step["first"]
+    with record(
+        [pushed("grip", {"width": "mm"})], process.stage.store, "recorded", simulated=True
+    ) as recorder:
+        for rows in step["rows"]:
+            try:
+                with recorder.trial(object="mug") as trial:
+                    for place in range(first, first + rows):
+                        trial.push("grip", None, float(place))
+                    trial.mark("slip")
+                    if step["fails"]:
+                        raise LookupError("the program fails")
+            except LookupError:
+                pass
+            process.notes.add(kept=f"recorded/{trial.id}", first=first, rows=rows)
+
+
+def carry(process: Process, step: dict[str, Any]) -> None:
+    """Export a trial for another program, import that, and compare the events."""
+    stage, form = process.stage, step["form"]
+    if not Store.exists(stage.store):
+        return
+    store = Store.open(stage.store)
+    names = sorted(store.campaign(NAME).committed())
+    if not names:
+        return
+    name, out = names[step["trial"] % len(names)], stage.folder / "exported"
+    shutil.rmtree(out, ignore_errors=True)
+    export(ExportRequest(str(stage.store), name, form, out))
+    (file,) = out.glob(f"{name}.*")
+    back = f"back{len(store.campaigns())}"
+    import_data(file, stage.store, name=back, simulated=True)
+    (known,) = store.campaign(back).committed()
+    one, other = (
+        store.campaign(each).recording(trial).events()
+        for each, trial in ((NAME, name), (back, known))
+    )
+    same = all(np.array_equal(getattr(one, part), getattr(other, part)) for part in "xyp")
+    if not same or not np.array_equal(np.diff(one.t_us), np.diff(other.t_us)):
+        process.notes.add(wrong="what is exported is whole", what=f"{name} as {form}")
+    process.notes.add(kept=f"{back}/{known}")
+
+
+def react(process: Process, step: dict[str, Any]) -> None:
+    """Let a detector listen in a trial's motion, at whose alarm a reflex cuts it short."""
+    stage = process.stage
+    request = stage.request(step["faults"])
+    witness = Witness(request.rig, process.host, process.notes, calm=not step["faults"])
+    witness.install()
+    witness.watch_reflexes()
+    process.host.most_s = NIGHT_S
+    measured = [each.id for each in request.plan if each.role == "measured"]
+    wanted = make_detect_request(
+        stage.folder / "rig.yaml",
+        None,
+        protocol=stage.folder / "protocol.yaml",
+        trial=measured[step["trial"] % len(measured)].rpartition(",r=")[0],
+        detector=named_source("rate", step["level"], None),
+        reflex=step["reflex"],
+        poll_s=0.05,
+    )
+    done = detect(wanted, show=False)
+    alarm, reflex = done["onsets"]["incipient"], done["reflex"]
+    assert reflex is not None
+    process.notes.add(reflex=reflex["done"], phase=reflex.get("phase"))
+    if alarm is not None and alarm["phase"] in ACTING and not reflex["done"]:
+        process.notes.add(wrong="an alarm in motion is answered", what=f"at {alarm['phase']}")
 
 
 def _remote(process: Process, step: dict[str, Any]) -> Remote:
@@ -404,5 +493,8 @@ DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "push": send,
     "pull": fetch,
     "serve": serve,
+    "record": take_down,
+    "carry": carry,
+    "react": react,
 }
 """What each kind of step does."""

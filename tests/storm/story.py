@@ -75,7 +75,10 @@ ALONE = {"mains_light", "arm_ramp"}
 def draw(seed: int) -> Story:
     """Return the story of a seed."""
     rng = random.Random(seed)
-    story = {"seed": seed, "protocol": _protocol(rng), "rig": _rig(rng)}
+    rig = _rig(rng)
+    # with a force limit, which is looked at all the time, a second costs six times as much
+    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 0.5, 5, 60])
+    story = {"seed": seed, "protocol": _protocol(rng, hold_s), "rig": rig}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
     steps: list[Step] = []
@@ -92,7 +95,7 @@ def draw(seed: int) -> Story:
     return {**story, "steps": steps}
 
 
-def _protocol(rng: random.Random) -> dict[str, Any]:
+def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
     data = protocol(rng.randint(3, 6))
     data["name"] = "storm"
     collection = data["collection"]
@@ -101,8 +104,9 @@ def _protocol(rng: random.Random) -> dict[str, Any]:
     factors["depth"]["values"] = [rng.choice([2.0, 2.4, 3.2])]
     factors["speed"]["values"] = [rng.choice([0.4, 0.4, 1.6, 4.0])]
     collection["motion"][3]["distance"] = f"{rng.choice([1.6, 4, 8])} mm"
-    settle, hold = rng.choice([0.2, 10]), rng.choice([0.5, 5])
-    collection["motion"][2] |= {"settle": f"{settle} s", "duration": f"{hold} s"}
+    settle_s = rng.choice([0.2, 10])
+    collection["motion"][2] |= {"settle": f"{settle_s} s", "duration": f"{hold_s} s"}
+    collection["limits"] = {**collection.get("limits", {}), "duration": "300 s"}
     collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0036 ms"])
     collection["gates"]["retakes"] = rng.choice([0, 2])
     warm_up = {"presses": 2, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
@@ -138,6 +142,14 @@ def _rig(rng: random.Random) -> dict[str, Any]:
     return rig
 
 
+def _trial_s(story: Story) -> float:
+    """Return about how long a trial takes, with what is done before it."""
+    collection = story["protocol"]["collection"]
+    motion, speed = collection["motion"], collection["factors"]["speed"]["values"][0]
+    seconds = sum(float(motion[2][name].split()[0]) for name in ("settle", "duration"))
+    return 8 + seconds + float(motion[3]["distance"].split()[0]) / float(speed)
+
+
 # -- steps ---------------------------------------------------------------------------------------
 
 
@@ -154,7 +166,7 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
         if rng.random() < 0.8:
             fault["trial"] = rng.randint(1, 6)
         if kind not in WHOLE_TRIALS:
-            fault["at_s"] = round(rng.uniform(0, 4), 2)
+            fault["at_s"] = round(rng.uniform(0, rng.choice([4, _trial_s(story)])), 2)
         if kind not in WHOLE_TRIALS and rng.random() < 0.3:
             fault["since"] = "trial"
         found.append(fault)
@@ -190,21 +202,21 @@ def _ask(rng: random.Random, story: Story, trials: int) -> Step:
     return made
 
 
-def _event(rng: random.Random, story: Story, trials: int) -> Step:
-    """Draw what happens at some time of a night."""
-    made = rng.choice(
-        [
-            _ask(rng, story, trials),
-            _ask(rng, story, trials),
-            {"signal": rng.choice(["SIGINT", "SIGTERM", "SIGHUP", "dropped", "dropped"])},
-            {"log": {"skin": str(rng.randint(2, 5))}},
-            {"log": {}},
-            {"clock": rng.choice([-7200, -3, 40, 90_000])},
-            {"rival": True},
-            _lie(rng, story),
-        ]
-    )
-    return {"at_s": round(rng.uniform(0, 130), 2), **made}
+def _event(rng: random.Random, story: Story, trials: int, night_s: float) -> Step:
+    """Draw what happens at some time of a night, which takes about `night_s`."""
+    drawn: list[Step] = [
+        _ask(rng, story, trials),
+        {"signal": rng.choice(["SIGINT", "SIGTERM", "SIGHUP", "dropped", "dropped"])},
+        {"log": {"skin": str(rng.randint(2, 5))}},
+        {"log": {}},
+        {"clock": rng.choice([-7200, -3, 40, 90_000])},
+        {"rival": True},
+        {"suspend": rng.choice([0.3, 5.0, 600.0])},
+        {"fill": rng.choice([0, RESERVE + 2000, RESERVE + 20_000])},
+        _lie(rng, story),
+    ]
+    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 4])[0]
+    return {"at_s": round(rng.uniform(0, 1.1 * night_s), 2), **made}
 
 
 def _lie(rng: random.Random, story: Story) -> Step:
@@ -214,12 +226,18 @@ def _lie(rng: random.Random, story: Story) -> Step:
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
-    events = [_event(rng, story, trials) for _ in range(rng.choice([0, 1, 2, 3]))]
-    window = {"window_s": round(rng.uniform(0, 200), 1)} if rng.random() < 0.15 else {}
+    most = rng.choice([None, None, None, 1, 2])  # so that later nights have trials left
+    night_s = (most or trials) * _trial_s(story)
+    events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3]))]
+    for event in [each for each in events if each.get("ask") == "pause"]:
+        if rng.random() < 0.6:  # who pauses goes on again, mostly
+            end_s = round(event["at_s"] + rng.uniform(0, 3 * night_s), 2)
+            events.append({"at_s": end_s, "ask": "resume"})
+    window = {"window_s": round(rng.uniform(0, 1.2 * night_s), 1)} if rng.random() < 0.15 else {}
     return {
         "faults": _faults(rng, story),
         "events": sorted(events, key=lambda event: event["at_s"]),
-        "most": rng.choice([None, None, 1, 2]),  # so that later nights have trials left
+        "most": most,
         **window,
         **_weather(rng),
     }
@@ -234,6 +252,24 @@ def _damage(rng: random.Random, story: Story, trials: int) -> Step:
 def _copy(rng: random.Random, story: Story, trials: int) -> Step:
     step = {"fails": rng.choice([0, 0, 2, 3, 5, 9]), "short": rng.random() < 0.3}
     return {**step, "check": rng.random() < 0.2, **_weather(rng)}
+
+
+def _record(rng: random.Random, story: Story, trials: int) -> Step:
+    rows = [rng.randint(1, 300) for _ in range(rng.randint(1, 2))]
+    # its thread writes in real time: the power fails when all is done, or not at all
+    cut = {"weather": {"power": {"at": 10**9, "torn": rng.choice([None, rng.randrange(1000)])}}}
+    step = {"first": rng.randrange(1000), "rows": rows, "fails": rng.random() < 0.3}
+    return {**step, **(cut if rng.random() < 0.3 else {})}
+
+
+def _carry(rng: random.Random, story: Story, trials: int) -> Step:
+    return {"trial": rng.randrange(trials), "form": rng.choice(["aedat4", "dsec"])}
+
+
+def _react(rng: random.Random, story: Story, trials: int) -> Step:
+    faults = _faults(rng, story) if rng.random() < 0.4 else []
+    step = {"trial": rng.randrange(trials), "level": rng.choice([40.0, 400.0])}
+    return {**step, "reflex": rng.choice(["stop", "press:0.2"]), "faults": faults}
 
 
 def _between(rng: random.Random, story: Story, trials: int) -> Step:
@@ -254,6 +290,9 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "push": (2, _copy),
     "pull": (2, _copy),
     "serve": (1, _serve),
+    "record": (0.4, _record),
+    "carry": (0.4, _carry),
+    "react": (0.3, _react),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 FOLLOWS = {

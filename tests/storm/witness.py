@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,10 @@ from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move, Position
+from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import ArmState, Segment
 from sliplab.rigs.core.motion_watch import is_near
+from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.arm import MockArm
 from sliplab.rigs.mock.world import SimulatedWorld
@@ -31,6 +33,10 @@ STUCK_S, STUCK_MM = 3.0, 0.5
 """Time, and motion at the commanded speed, until a pose that does not change stops the arm."""
 SILENT_S = 0.5
 """Until a force sensor that does not answer has stopped the arm."""
+RATES_HZ = {"frames/t": 100.0, "poses/t": 500.0}
+"""Rows a second while streams run, of those that nobody changes."""
+FORCE_SHARE = 1.1
+"""Times its limit that a true force may be, for noise, and until the next sample."""
 ZERO_MM = 0.15
 """How far depth zero may be from the true plate where nothing disturbs it."""
 WAIT_S = 0.05
@@ -47,7 +53,7 @@ class Witness:
         calm: no fault of a device disturbs where the arm is.
 
     Attributes:
-        resumed: a pause has ended, and depth zero was not found since.
+        resumed: a pause has ended, or another skin was logged, and depth zero not found since.
         lie: what a device reports that is not so.
     """
 
@@ -55,16 +61,21 @@ class Witness:
         limits = file.limits
         self._calm = calm
         self.lie = Lie(lambda: host.passed_s)
+        self._lied = ""
         self._lied_s: float | None = None
         self._segment: Segment | None = None
         self._misled = False
+        self._world: SimulatedWorld | None = None
+        self._pass_time: Callable[[SimulatedWorld, int], None]
+        self._force_n = None if limits.force is None else float(limits.force)
+        self._forced_s: float | None = None
         self._depth_mm, self._reach_mm = float(limits.depth), float(limits.reach)
         self._speed_mm_s, self._poll_s = float(limits.speed), float(file.poll)
-        self._host, self._notes = host, notes
+        self._host, self._notes, self._streams_s = host, notes, 0.0
         self._asked_s: float | None = None
         self._starts = 0
         self._outside: tuple[float, float] | None = None
-        self.resumed = False
+        self.resumed = self.skin_logged = False
         self._rezeroes = False
 
     def wrong(self, invariant: str, what: str) -> None:
@@ -76,13 +87,49 @@ class Witness:
         if self._asked_s is None:
             self._asked_s, self._starts = self._host.passed_s, 0
 
+    def suspend(self, seconds: float) -> None:
+        """Let time pass in which this process does nothing, and others and devices go on."""
+        if self._world is None:
+            return
+        began_s = self._host.passed_s
+        self._pass_time(self._world, round(seconds * 1e9))
+        late_s = self._host.passed_s - began_s  # which no program can make up for
+        self._asked_s = None if self._asked_s is None else self._asked_s + late_s
+        self._lied_s = self._outside = self._forced_s = None
+
+    def watch_reflexes(self) -> None:
+        """Hold each reflex against where the arm truly is."""
+        react: Any = reacting._react
+
+        def reacting_to(rig: Rig, phase: str, reflex: Reflex, *given: Any) -> Any:
+            made = react(rig, phase, reflex, *given)
+            world = self._world
+            assert world is not None
+            if world.path.moving(world.now_ns):
+                self.wrong("a reflex stops the arm", f"it still moves after a {reflex.kind}")
+            depth_mm = float(world.path.states(np.array([world.now_ns], np.int64))[0][8])
+            if self._calm and not abs(depth_mm - made.depth_mm) <= ZERO_MM + PLACE_MM:
+                what = f"it is {depth_mm:.2f} mm deep, reported are {made.depth_mm:.2f}"
+                self.wrong("a reflex is as it says", what)
+            deeper_mm = made.depth_mm - made.stopped_mm[2]
+            most_mm = reflex.deeper_mm if reflex.kind == "press" else 0.0
+            least_mm = min(most_mm, reflex.deepest_mm - made.stopped_mm[2])
+            if self._calm and not least_mm - 0.1 <= deeper_mm <= most_mm + 0.1:
+                self.wrong("a reflex is as it says", f"{reflex.kind} goes {deeper_mm:.2f} mm in")
+            return made
+
+        reacting._react = reacting_to
+
     def install(self) -> None:
         """Watch every arm of this process."""
         start, pass_time = MockArm.start, SimulatedWorld.pass_time
         run_trial: Any = Rig.run_trial
         rezero: Any = Rig.rezero
         take_step: Any = Rig.take_step
+        start_streams: Any = Rig.start_streams
+        stop_streams: Any = Rig.stop_streams
         self.lie.install()
+        self._pass_time = pass_time
 
         def starting(arm: MockArm, path: Sequence[Segment]) -> None:
             self._look_at_path(arm._world, path)
@@ -95,6 +142,7 @@ class Witness:
             self._misled = self.lie.active in {"pose_away", "pose_frozen"}
 
         def passing(world: SimulatedWorld, ns: int) -> None:
+            self._world = world
             pass_time(world, ns)
             self._look(world)
 
@@ -110,9 +158,21 @@ class Witness:
             self._look_at_step(rig, step, at, self._host.passed_s - began_s)
             return times
 
+        def starting_streams(rig: Rig, *given: Any, **named: Any) -> None:
+            start_streams(rig, *given, **named)
+            self._streams_s = self._host.passed_s
+
+        def stopping_streams(rig: Rig, sink: Any) -> None:
+            took_s = self._host.passed_s - self._streams_s
+            stop_streams(rig, sink)
+            for name, rate_hz in RATES_HZ.items() if isinstance(sink, Tee) and self._calm else ():
+                rows = sink.columns[name][0]
+                if not rows >= rate_hz * took_s - 2:
+                    self.wrong("what happened is recorded", f"{rows} rows of {name} in {took_s} s")
+
         def running(rig: Rig, program: Any, sink: Any, *more: Any, **named: Any) -> Any:
             if self.resumed and self._rezeroes:
-                self.wrong("a pause may change the rig", "depth zero is not found again after one")
+                self.wrong("pauses and skins change the rig", "depth zero is not found again")
             self.resumed = False
             tee = Tee(sink)
             done = run_trial(rig, program, tee, *more, **named)
@@ -123,6 +183,8 @@ class Witness:
         SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
         Rig.run_trial = running  # type: ignore[method-assign]
         Rig.rezero = rezeroing  # type: ignore[method-assign]
+        Rig.start_streams = starting_streams  # type: ignore[method-assign]
+        Rig.stop_streams = stopping_streams  # type: ignore[method-assign]
         Rig.take_step = stepping  # type: ignore[method-assign]
 
     def watch(self, supervisor: CollectionSupervisor, plan: Plan) -> None:
@@ -145,6 +207,8 @@ class Witness:
                 self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
             if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
                 self.wrong("requests are carried out", "continues in spite of a stop")
+            if self.skin_logged:
+                self.resumed, self.skin_logged = True, False
             if until is not None and self._host.wall_s > until:
                 self.wrong("no trial begins outside its window", trial.id)
             folders = campaign.folders("trials")
@@ -157,9 +221,11 @@ class Witness:
 
     def _look_at_zero(self, rig: Rig) -> None:
         """Hold depth zero, which was just found, against the true plate."""
+        if not self._calm:  # a fault's arm stands before the simulated one
+            return
         pose = rig.plate_frame.pose(Position(0.0, 0.0, 0.0))
         off = float(_world(rig).plane.sensor(pose)[2])
-        if self._calm and not abs(off) <= ZERO_MM:
+        if not abs(off) <= ZERO_MM:
             self.wrong("depth zero is the plate", f"it is {off:.3f} mm off")
 
     def _look_at_step(self, rig: Rig, step: Any, at: Position, took_s: float) -> None:
@@ -212,8 +278,8 @@ class Witness:
         if not (kind and moving and segment) or (kind == "pose_away" and self._misled):
             self._lied_s = None
             return
-        if self._lied_s is None:
-            self._lied_s = now_s
+        if self._lied_s is None or kind != self._lied:
+            self._lied, self._lied_s = kind, now_s
         bound_s = self._poll_s + SLACK_S
         if kind == "pose_frozen":
             frozen = self.lie.frozen
@@ -222,17 +288,34 @@ class Witness:
             bound_s += STUCK_S + STUCK_MM / segment.speed_mm_s + self._poll_s
         elif kind.startswith("force"):
             there = world.plane.sensor(segment.to)
-            if math.dist(place[:2], there[:2]) < 0.5 and there[2] < place[2]:
+            straight = self._misled or math.dist(place[:2], there[:2]) < 0.5
+            if straight and there[2] < place[2]:
                 return  # it leaves the plate, whatever the sensor says
             bound_s = SILENT_S
         if now_s - self._lied_s > bound_s:
             self.wrong("no news and no number are a fault", f"moves on in spite of {kind}")
+
+    def _look_at_force(self, now_s: float, moving: bool, place: Any, world: SimulatedWorld) -> None:
+        """A force beyond the limit stops the arm, unless it leaves the plate."""
+        wrench, segment = world.physics.wrench, self._segment
+        if self._force_n is None or wrench is None or segment is None or not moving:
+            self._forced_s = None
+            return
+        true_n = math.dist(wrench.at(np.array([wrench.end_ns]))[0][:3], (0.0, 0.0, 0.0))
+        leaves = world.plane.sensor(segment.to)[2] < place[2] - 0.01
+        if not true_n > FORCE_SHARE * self._force_n or leaves:
+            self._forced_s = None
+        elif self._forced_s is None:
+            self._forced_s = now_s
+        elif now_s - self._forced_s > SILENT_S and self.lie.active != "force_silent":
+            self.wrong("within limits", f"moves on with {true_n:.1f} N on the plate")
 
     def _look(self, world: SimulatedWorld) -> None:
         """Look at the arm where it truly is now."""
         now_s, moving = self._host.passed_s, world.path.moving(world.now_ns)
         place = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
         self._look_at_lie(now_s, moving, place, world)
+        self._look_at_force(now_s, moving, place, world)
         if self._asked_s is not None and moving and self._starts == 0:
             late = now_s - self._asked_s
             if late > self._poll_s + 1e-3:
