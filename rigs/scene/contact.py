@@ -446,7 +446,8 @@ def settle(w: Block, law: Law, start_s: float, h: float, decay: float) -> None:
         speed, earlier = slip / part if slip > 0.0 else 0.0, w.speed[j]
         # a tip that just let go, or slows down fast, differs from its state a step ago
         steady = slip > 0.0 and share < 0.0 and is_steady(earlier, speed)
-        if end == SLIDING and w.quick[j] * slip + w.lag[j] < law.least_mm_s:
+        rests = law.least_mm_s > 0.0 and w.quick[j] * slip + w.lag[j] < law.least_mm_s
+        if end == SLIDING and rests:
             w.mode[j], speed, steady = STUCK, 0.0, False
         w.earlier[j] = earlier if steady and w.slid_s[j] == h else -1.0
         w.slid_s[j], w.speed[j] = h if steady else 0.0, speed

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.analysis.detectors.papillae import LEAST
+from sliplab.analysis.detectors.papillae import LEAST, VERSION
 from sliplab.analysis.detectors.skin import calibrated, load_calibration
 from sliplab.flows.running import exit_codes, stopping
 from sliplab.protocols import InputError
@@ -149,7 +149,7 @@ def test_a_skin_that_was_not_seen_writes_nothing(
     ("change", "says"),
     [
         ({"detector": "rate"}, "detector = rate: must be papillae"),
-        ({"version": 99}, "version = 99: must be 2"),
+        ({"version": 99}, f"version = 99: must be {VERSION}"),
         ({"level": "high"}, "level"),
         ({"format": 2}, "newer version"),
         ({"level": 1e9}, "level = .*: must be 12, of hold and unload"),
