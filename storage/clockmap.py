@@ -90,7 +90,7 @@ class ClockMap:
         return cls(tuple(device_ns[:-1]), tuple(reference_ns[:-1]), tuple(drift))
 
     def drift_ppm(self, device_ns: int | None = None) -> float:
-        """Return the reference's gain at a time; by default the mean over all knots, ppm."""
+        """Return the reference's rate offset at a time, ppm; by default the mean of all knots."""
         if device_ns is not None or len(self.drift) == 1:
             k = 0 if device_ns is None else self._piece(device_ns)
             return self.drift[k] / 1e12

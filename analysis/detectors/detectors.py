@@ -276,7 +276,7 @@ class BalancedLogistic:
         """Return the same as `Likelihood.log`."""
         scaled = (np.asarray(features, np.float64) - self.mean) / self.scale
         # not a matrix product, whose rounding depends on how many windows there are: a detector
-        # must say the same of a window whatever comes after it
+        # a window's output must not depend on later windows
         linear = np.broadcast_to(self.weights[0], (len(scaled), len(self.weights[0]))).copy()
         for column, weights in zip(scaled.T, self.weights[1:], strict=True):
             linear += column[:, None] * weights

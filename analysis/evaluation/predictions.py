@@ -128,7 +128,7 @@ def prediction_judgement(
     if kind != "spikes":
         margin = 0.0 if margin is None else margin
         if margin > 1:
-            faults.append(InputError("--margin", "", margin, "must be a share from 0 to 1 here"))
+            faults.append(InputError("--margin", "", margin, "must be a fraction from 0 to 1"))
     known = list(trial_windows(labels, campaigns, "test"))
     found = _outputs(table, known, where, faults)
     outputs = {}

@@ -225,7 +225,7 @@ def _windows(
 ) -> tuple[list[ReviewStatistic], dict[Name, float]]:
     """Return the accuracy of the test windows, if they were stored, and shares of training windows.
 
-    The shares are by trial, of windows that its review changes.
+    Each is the fraction of a trial's training windows whose label the review changes.
     """
     item = next((item for item in campaigns if item.experiment == "kinematic"), None)
     if item is None:

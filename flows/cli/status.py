@@ -92,7 +92,7 @@ def log(
         _add(opened, text, changed, campaign, who, as_json)
         return
     if who is not None:
-        raise InputError("--who", "", who, "needs a note, --skin or --context")
+        raise InputError("--who", "", who, "is valid only with a note, --skin or --context")
     there = [item.name for item in opened.campaigns()]
     for name in campaign or ():
         if name not in there:

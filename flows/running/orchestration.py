@@ -466,7 +466,7 @@ def _reported(
     try:
         run_flow(reported_flow, flow_run=flow_run, parameters={"argument": argument})
         delivered = True
-    except (PrefectSignal, CancelledRun, PausedRun) as error:  # so the server, or the work, decided
+    except (PrefectSignal, CancelledRun, PausedRun) as error:  # raised by the server or by the work
         delivered = not work.started or error is work.error
     except Exception as error:
         if not work.started:

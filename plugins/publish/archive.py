@@ -48,7 +48,7 @@ STREAM_COLUMNS = {
 
 
 def onset_table(publication: Publication) -> pd.DataFrame:
-    """Return one row an onset, of each labelled trial two.
+    """Return one row per onset, two per labelled trial.
 
     Raises:
         InputError: no trial has a label.

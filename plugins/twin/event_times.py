@@ -155,7 +155,7 @@ def count_intervals(t_us: Any, x: Any, y: Any, chosen: Any, last_us: Any, counts
 
 
 def dead_time_us(counts: I64, rate_hz: float, period_us: float | None) -> float:
-    """Return the dead time by the intervals of pixels that fire at random; NaN with too few.
+    """Estimate the refractory period from the intervals of noise pixels; NaN with too few.
 
     Beyond the dead time intervals are exponential. The likelihood is that of Poisson counts of
     whole periods.

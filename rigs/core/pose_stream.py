@@ -37,7 +37,7 @@ Stamped = tuple[int, int, tuple[Pose, ...]]
 
 
 class PoseJumpError(RuntimeError):
-    """Poses that the arm cannot have reached, or times that cannot have passed, in a row."""
+    """Consecutive poses that the arm cannot have reached, or impossible time stamps."""
 
 
 class PoseCheck:

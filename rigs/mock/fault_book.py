@@ -1,7 +1,8 @@
 """The faults of a trial and their times, in one object that all simulated devices query.
 
 Every fault has one true time, however the devices divide time into calls. Its effect is implemented
-where it occurs: with the pulses, the clocks, the frames, the arm.
+where it occurs: with the pulses, the clocks, the frames, the arm. Their kinds are declared
+in `rigs/core/faults.py`.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ def _pass_rim(
     out: I64,
     n: int,
 ) -> int:
-    """Apply a passing marker to a cell; see `advance`. `arcs`: largest path in each step, px."""
+    """Apply a passing marker to a cell; see `advance`. `arcs`: longest path per step, px."""
     for k in range(first, last):
         parts = max(int(np.ceil(arcs[k] / _PART_PX)), 1)
         h = (until[k] - since[k]) / parts

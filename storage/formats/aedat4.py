@@ -539,7 +539,7 @@ def _trial(file: Aedat4File, path: Path, name: str, end: int | None) -> ForeignT
 def _export(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write everything on the event camera's clock, us; frames at the middle of their exposure."""
     if not (has_events(recording, stream) or recording.has_video):
-        raise ValueError("has neither events nor a video, and AEDAT4 holds those alone")
+        raise ValueError("has neither events nor a video; AEDAT4 can store nothing else")
     source = f"sliplab {SIMULATED}" if recording.simulated else "sliplab"
     triggers = recorded_triggers(recording, stream)
     streams = {0: Aedat4Stream(EVENTS, "events", event_size(recording, stream), source)}

@@ -435,7 +435,7 @@ def _pixels(values: Any) -> I64:
 def _export(recording: Recording, path: Path, stream: str) -> dict[str, int]:
     """Write events and triggers; DSEC's event file holds no frames."""
     if not has_events(recording, stream):
-        raise ValueError("has no events, and DSEC's file holds those alone")
+        raise ValueError("has no events; DSEC's file can store nothing else")
     triggers = recorded_triggers(recording, stream)
     with recording.open(stream) as reader:
         count = write_dsec(path, reader.event_chunks(), triggers, simulated=recording.simulated)

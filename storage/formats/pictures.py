@@ -73,7 +73,7 @@ def video_frames(path: Path) -> Iterator[U8]:
 def levels_of(frame: Any) -> U8:
     """Return the grey levels of a decoded frame, shape (height, width).
 
-    Those of a grey video are its own, to the bit.
+    The pixel values of a grey video are unchanged.
     """
     if frame.format.name in {"gray", "gray8"}:
         return np.asarray(frame.to_ndarray(format="gray"), np.uint8)

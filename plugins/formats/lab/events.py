@@ -41,7 +41,7 @@ _PART = re.compile(
 SIZES = ((480, 640), (260, 346), (180, 240), (128, 128))
 """Rows and columns of the lab's cameras: DVXplorer, DAVIS346, DAVIS240, eDVS."""
 _MOST_EVEN = 1 << 24
-"""Times of a `.npy` file with as many in every pixel, which few recordings have."""
+"""Times of a `.npy` file with the same number for every pixel, which few recordings have."""
 _PICKLES = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 _KNOWN = " or ".join(f"{width} x {height}" for height, width in SIZES)
 _RIGHT = f"the lab's files hold a list of times in ms for each pixel of {_KNOWN}"
@@ -267,7 +267,8 @@ def _from_numpy(data: bytes, path: Path) -> Any:
     if dtype.kind not in "iuf" or len(shape) != 3 or not _is_camera(shape[:2]):
         raise FormatError(f"holds an array of {dtype} of shape {shape}; {_RIGHT}")
     if math.prod(shape) > _MOST_EVEN:
-        raise FormatError(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
+        held = f"holds {math.prod(shape)} times, the same number for every pixel"
+        raise FormatError(f"{held}; {_RIGHT}")
     if math.prod(shape) * dtype.itemsize != len(data) - at:
         raise Damage(f"is truncated: {len(data) - at} bytes for an array of shape {shape}")
     numbers = np.frombuffer(data, dtype, offset=at).reshape(shape, order="F" if fortran else "C")

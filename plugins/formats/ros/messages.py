@@ -283,7 +283,7 @@ def pack_mono(chunk: EventChunk, base_ns: int) -> bytes:
         FormatError: a row needs more than 15 bits.
     """
     if int(chunk.y.max(initial=0)) >= 1 << 15:
-        raise FormatError(f"has an event in row {chunk.y.max()}, and 15 bits hold a row")
+        raise FormatError(f"has an event in row {chunk.y.max()}; the format ends at row 32767")
     words = (chunk.t_us * 1000 - base_ns).astype(np.uint64)
     words |= chunk.x.astype(np.uint64) << np.uint64(32)
     words |= chunk.y.astype(np.uint64) << np.uint64(48)

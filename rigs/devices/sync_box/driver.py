@@ -314,8 +314,8 @@ class SerialSyncBox:
             if quiet_s > self._train.longest_gap_s + self._settings.silence_s:
                 port.fail(
                     SyncBoxFault(
-                        f"no pulse reported for {quiet_s:.1f} s: it was reset, unplugged or hangs. "
-                        f"Check its cable and supply, then start the trial again"
+                        f"no pulse reported for {quiet_s:.1f} s: it was reset or unplugged, or its "
+                        f"firmware hangs. Check its cable and supply, then start the trial again"
                     )
                 )
         port.check()

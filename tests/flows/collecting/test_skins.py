@@ -288,7 +288,7 @@ def test_the_command_refuses_what_it_cannot_keep(tmp_path: Path) -> None:
         (("\x1b[31mred",), "must be one line without control characters"),
         (("--context", "skin"), "must be NAME=VALUE"),
         (("x", "--campaign", "c"), "needs --skin or --context"),
-        (("--who", "anna"), "needs a note, --skin or --context"),
+        (("--who", "anna"), "is valid only with a note, --skin or --context"),
         (("--skin", "a b"), "--context: skin = a b: must be a text"),
         (("--campaign", "c"), "--campaign = c: is not there: no campaign has begun"),
     ):

@@ -210,7 +210,7 @@ BAD: list[tuple[str, bytes | Callable[[Path], object], str]] = [
     (
         "a_on.npy",
         lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
-        r"a_on\.npy: holds 20160000 times, as many in every pixel",
+        r"a_on\.npy: holds 20160000 times, the same number for every pixel",
     ),
     ("a_on.npy", OTHER, r"a_on\.npy: contains data other than the array \(8, 6\)"),
     ("a_on.npy", _npy(np.zeros((39, 2, 250))), r"shape \(39, 2, 250\); the lab's"),
