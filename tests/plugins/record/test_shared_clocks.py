@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import threading
 import time
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from sliplab.protocols.yaml_file import validate
 from sliplab.storage.trials.store import Store
 
 STATED_MS = 2.0
+TOGETHER_NS = 50_000
 RECORDINGS = (6, 200)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("clock", ["ptp", "utc"])
 @pytest.mark.parametrize(
     "count", [RECORDINGS[0], pytest.param(RECORDINGS[1], marks=pytest.mark.long)], ids=str
@@ -58,14 +61,20 @@ def pushed(trial: RecordedTrial, clock: str, error_ns: int) -> tuple[int, int]:
     """Push some rows; return the stamp of the last one, and its true time on the host's clock."""
     shared = {"ptp": time.CLOCK_TAI, "utc": time.CLOCK_REALTIME}[clock]
     for _ in range(4):
-        stamp_ns = time.clock_gettime_ns(shared) + error_ns
-        true_ns = time.monotonic_ns()
+        before_ns, now_ns, after_ns = _both(shared)
+        while after_ns - before_ns > TOGETHER_NS:  # this process did not run in between
+            before_ns, now_ns, after_ns = _both(shared)
+        stamp_ns, rows = now_ns + error_ns, trial.rows()["glove"]
         trial.push("glove", stamp_ns, 1.0)
-        rows = trial.rows()["glove"]
-        deadline = time.monotonic() + 10
-        while trial.rows()["glove"] == rows and time.monotonic() < deadline:
-            time.sleep(0.001)
-    return stamp_ns, true_ns
+        end, pause = time.monotonic() + 10, threading.Event()
+        while trial.rows()["glove"] == rows and time.monotonic() < end:
+            pause.wait(0.001)
+    return stamp_ns, (before_ns + after_ns) // 2
+
+
+def _both(shared: int) -> tuple[int, int, int]:
+    """Read the host's clock, the shared one, and the host's again, ns."""
+    return time.monotonic_ns(), time.clock_gettime_ns(shared), time.monotonic_ns()
 
 
 def test_an_error_must_be_stated() -> None:
