@@ -127,8 +127,8 @@ def _interval_note(found: BenchResult) -> str:
     few = few_words(min([worlds, *disturbed]))
     text = f"{text}; {few}." if few else f"{text}."
     if found.limit is not None:
-        known = _median(found.limit.points[0].latency_ms)
-        text += f" An observer that knows the scene would need {known} ms."
+        known = _median(found.limit.points[0].latency_ms).replace(" (", " ms (")
+        text += f" An observer that knows the scene would need {known}."
     return text
 
 
