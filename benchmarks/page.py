@@ -103,11 +103,11 @@ def _page(store: Path) -> Iterator[tuple[Child, str]]:
         child.stdout.close()
 
 
-def measure(runs: int = RUNS, seconds: float = 20.0) -> Figures:
+def measure(runs: int = RUNS, seconds: float = 10.0) -> Figures:
     """Take trials for so long with viewers, and for so long without, `runs` times."""
     ratios, shares, feeds, rates = [], [], [], []
     with ExitStack() as stack:
-        work = stack.enter_context(open_session("rehearsal", 800))
+        work = stack.enter_context(open_session("rehearsal", 860))
         (feed,) = (f"self/task/{t.native_id}" for t in threading.enumerate() if t.name == FEED)
         child, link = stack.enter_context(_page(work.collector.campaign.folder.parents[1]))
         work.take(2)  # compiled
