@@ -5,7 +5,7 @@ event camera hands them over. What is timed is the call that ends a window: binn
 network's spikes, the rule. Nothing waits for real time; the hour is the stream's.
 
 The detector by single papillae has the same slide with a million events a second, in packets of
-1 ms: what is timed is the call with a packet, whose evidence it returns.
+1 ms. The timed call returns a packet's evidence.
 """
 
 from __future__ import annotations

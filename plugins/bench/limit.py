@@ -24,7 +24,7 @@ STEP_NS = 1_000_000
 BEFORE, AFTER = 100, 250
 """Steps before and after the slip."""
 SLOPE_NS = 30_000_000
-"""Time before the slip whose loading goes on without it."""
+"""Time before the slip in which the loading is measured that continues without it."""
 DRAWN = 8
 SMOOTHED = 5
 """Steps over which rates are means, the slip's step a border."""
@@ -99,7 +99,7 @@ def certain_after(seen: F64, slid: F64, stuck: F64, asked: Sequence[float]) -> l
 
 
 def level_of(per_hour: float) -> float:
-    """Return the level of Page's test whose mean time to a false alarm is at least so long."""
+    """Return the level at which Page's test has at most this rate of false alarms."""
     return math.log(3600e9 / STEP_NS / per_hour)
 
 

@@ -77,10 +77,10 @@ class FakeSyncBox(FakeSerial):
 
     # -- faults ----------------------------------------------------------------------------
 
-    def reset(self, told: bool = True) -> None:
+    def reset(self, announced: bool = True) -> None:
         """Restart as after a brown-out: no train, clock at 0, and the board's start message."""
         self._thread.call(self._power_on)
-        if told:
+        if announced:
             self._thread.call(lambda: self._say(f"B {NAME}"))
 
     def answer_late(self) -> None:

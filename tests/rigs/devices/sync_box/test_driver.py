@@ -164,7 +164,7 @@ def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box
 
 def test_a_reset_whose_word_is_lost_is_silence(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
-    wire.reset(told=False)
+    wire.reset(announced=False)
     assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
 
 
