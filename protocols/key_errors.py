@@ -136,7 +136,10 @@ def _fault(model: type[BaseModel], item: Any) -> KeyedError:
     if kind in {"union_tag_invalid", "union_tag_not_found"}:
         tags = str(context.get("expected_tags", "")).replace("'", "")
         tag = str(context.get("discriminator", "'kind'")).strip("'")
+        tags = tags or _tags_at(model, loc, tag)
         found = value.get(tag) if isinstance(value, dict) else value
+        if found is None and isinstance(value, dict) and (close := nearest(tag, map(str, value))):
+            return KeyedError(f"{key}.{close}", value[close], f"{UNKNOWN}; did you mean '{tag}'?")
         hint = did_you_mean(str(found), tags.split(", ")) if found is not None else ""
         return KeyedError(f"{key}.{tag}", found, f"must be one of {tags}{hint}")
     message = re.sub("^[A-Z][a-z]+ should", "must", item["msg"])
@@ -257,6 +260,12 @@ def register_tags_of(key: str, *names: str) -> None:
 
 
 def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    fields = getattr(_model_at(model, loc), "model_fields", {})
+    return [field.alias or name for name, field in fields.items()]
+
+
+def _model_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> Any:
+    """Return the model at a place, the several that a union has there, or None."""
     current: Any = model
     before = ""
     for part in loc:
@@ -268,11 +277,18 @@ def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
             continue
         field = getattr(current, "model_fields", {}).get(part)
         if field is None:
-            return []
+            return None
         current = field.annotation
         current = _inner(current)
-    fields = getattr(current, "model_fields", {})
-    return [field.alias or name for name, field in fields.items()]
+    return current
+
+
+def _tags_at(model: type[BaseModel], loc: tuple[int | str, ...], tag: str) -> str:
+    """Return the values that a key may have which chooses one of several models."""
+    found = _model_at(model, loc)
+    fields = [each.model_fields.get(tag) for each in found] if isinstance(found, list) else []
+    every = [get_args(field.annotation) for field in fields if field is not None]
+    return ", ".join(str(value) for values in every for value in values)
 
 
 def _inner(annotation: Any) -> Any:

@@ -83,8 +83,15 @@ def _signal(source: Any, name: str, unit: str | None) -> tuple[Ints, Floats]:
         t_ns, values = signal_of_csv(Path(source), unit)
         name = str(source)
     else:
-        times, given = source
-        t_ns, values = events_from(times, name, unit).ns, np.asarray(given, np.float64)
+        try:
+            times, given = source
+            values = np.asarray(given, np.float64)
+        except (TypeError, ValueError):
+            right = "must be a CSV file, or a pair of times and values of numbers"
+            raise InputError(name, "", None, right) from None
+        t_ns = events_from(times, name, unit).ns
+    if not values.size:
+        raise InputError(name, "values", None, "has no samples")
     if values.ndim not in {1, 2} or len(values) != len(t_ns):
         raise InputError(name, "values", values.shape, f"must have {len(t_ns)} rows, one a time")
     if np.any(np.diff(t_ns) < 0):

@@ -223,6 +223,9 @@ def push(
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
     if clock not in {"host", "own", *SHARED}:
         raise InputError(name, "clock", clock, "must be host, own, ptp or utc")
+    if uncertainty_ms is not None and not _is_bound(uncertainty_ms):
+        right = "must be a finite number of milliseconds, not negative"
+        raise InputError(name, "uncertainty_ms", uncertainty_ms, right)
     if clock in SHARED and uncertainty_ms is None:
         raise InputError(name, "uncertainty_ms", None, f"is needed with clock={clock!r}")
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
@@ -244,6 +247,13 @@ def push(
         how = clock if clock in SHARED else HOST
     error = None if uncertainty_ms is None else uncertainty_ms * 1e6
     return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
+
+
+def _is_bound(value: object) -> bool:
+    """Return whether a value is a finite number, not negative."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return False
+    return 0 <= float(value) < float("inf")
 
 
 def usb_camera(

@@ -60,6 +60,12 @@ def test_a_misspelt_key_of_a_phase_is_told_by_the_keys_of_that_phase(
     assert "action" not in told
 
 
+def test_a_phase_that_is_missing_or_misspelt_is_told_by_the_phases(tmp_path: Path) -> None:
+    found = faults(tmp_path, ("{phase: press,", "{phse: press,"), ("{phase: return, ", "{"))
+    assert found["collection.motion[1].phse"] == "unknown key; did you mean 'phase'?"
+    assert "must be one of approach, press, hold, slide" in found["collection.motion[5].phase"]
+
+
 def test_faults_of_text_keys_and_rules_are_reported_together(tmp_path: Path) -> None:
     found = faults(
         tmp_path,

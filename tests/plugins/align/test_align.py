@@ -420,3 +420,9 @@ def test_a_file_that_is_read_is_not_written_over(tmp_path: Path, name: str) -> N
     assert said.returncode == 2
     assert "name another file" in said.stderr
     assert (tmp_path / name).read_bytes() == before
+
+
+@pytest.mark.parametrize("wrong", [None, np.arange(9.0), ([], []), ([0.0, 1.0], ["a", "b"])])
+def test_what_is_no_signal_with_taps_is_named(wrong: Any) -> None:
+    with pytest.raises(InputError, match=r"a pair of times and values of numbers|has no samples"):
+        sliplab.align_taps(wrong, wrong)

@@ -77,6 +77,13 @@ def _both(shared: int) -> tuple[int, int, int]:
     return time.monotonic_ns(), time.clock_gettime_ns(shared), time.monotonic_ns()
 
 
+@pytest.mark.parametrize("wrong", [-1, float("nan"), float("inf"), True, "a"], ids=str)
+@pytest.mark.parametrize("clock", ["host", "utc"])
+def test_a_stated_error_is_a_finite_number(clock: str, wrong: object) -> None:
+    with pytest.raises(InputError, match="must be a finite number of milliseconds"):
+        push("glove", {"pull": "N"}, clock=clock, uncertainty_ms=wrong)  # type: ignore[arg-type]
+
+
 def test_an_error_must_be_stated() -> None:
     with pytest.raises(InputError, match="uncertainty_ms"):
         push("glove", {"pull": "N"}, clock="ptp")
