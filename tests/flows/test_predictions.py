@@ -90,7 +90,7 @@ def test_probabilities_and_classes_are_judged_by_any_lead(
     perfect = own[["trial", "start_ns"]].assign(**{"class": truth.fillna("no_slip")})
     found = store.evaluate(predictions=perfect)
     assert found["accuracy"].strict == found["accuracy"].argmax == 1
-    with pytest.raises(sliplab.InputError, match="--margin = 2: must be a share"):
+    with pytest.raises(sliplab.InputError, match="--margin = 2: must be a fraction from 0 to 1"):
         store.evaluate(predictions=perfect, margin=2)
 
 
