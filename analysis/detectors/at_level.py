@@ -65,8 +65,10 @@ class AtLevel(StreamDetector):
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `StreamDetector`. Raises DetectorError."""
         before_us = self._settled_us
-        held = EventChunk.concatenate([self._held, events[events.t_us >= before_us]])
-        if (np.diff(held.t_us) < 0).any():
+        late = events.t_us < before_us
+        held = events[~late] if late.any() else events
+        held = EventChunk.concatenate([self._held, held]) if len(self._held) else held
+        if (held.t_us[1:] < held.t_us[:-1]).any():
             held = held[np.argsort(held.t_us, kind="stable")]
         cut = int(np.searchsorted(held.t_us, until_us))
         given, self._held = held[:cut], held[cut:]

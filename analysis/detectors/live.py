@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TypedDict
 
 import numpy as np
@@ -201,10 +202,10 @@ class LiveDetector:
         if not len(chunk):
             return []
         chunk = self._ordered(chunk)
-        edges = np.flatnonzero(np.diff(chunk.t_us) > self._gap_us) + 1
+        edges = np.flatnonzero(chunk.t_us[1:] - chunk.t_us[:-1] > self._gap_us) + 1
         made = []
-        for part in np.split(np.arange(len(chunk)), edges) if len(edges) else [slice(None)]:
-            events = chunk[part]
+        for begin, end in pairwise([0, *edges.tolist(), len(chunk)]):
+            events = chunk[begin:end] if len(edges) else chunk
             self._come_to(int(events.t_us[0]))
             last_us = int(events.t_us[-1])
             self._now_us = last_us if self._now_us is None else max(self._now_us, last_us)

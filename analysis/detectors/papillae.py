@@ -62,6 +62,7 @@ SEEN_MS = 250
 PLACES_MS = 10
 """Interval of finding the places, and of measuring the dispersion."""
 KEPT_MS = SEEN_MS + PLACES_MS
+SEEN_BLOCKS = SEEN_MS // PLACES_MS
 DISPERSION_MS = 60
 """Time over which the dispersion is averaged."""
 FEWEST_PLACES = 10
@@ -140,6 +141,7 @@ class Papillae(Detector):
         cells = self._shape[0] * self._shape[1]
         self._held = EventChunk.empty()
         self._kept = np.zeros((KEPT_MS, 2, cells), np.uint32)
+        self._blocks = np.zeros((SEEN_BLOCKS + 1, 2, cells), np.uint32)
         self._events = np.zeros((2, cells), np.int64)
         self._place = np.full(cells, -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
@@ -160,7 +162,7 @@ class Papillae(Detector):
                 self._find_places(at)
             end = min(at - at % PLACES_MS + PLACES_MS, last)
             part = slice(done, done := int(np.searchsorted(ms, end)))
-            _keep(ms[part], cells[part], on[part], at, end, self._kept)
+            _keep(ms[part], cells[part], on[part], at, end, self._kept, self._blocks)
             self._advance(at, value[at - first : end - first])
             if end % PLACES_MS == 0:
                 self._measure_dispersion()
@@ -198,34 +200,44 @@ class Papillae(Detector):
     @property
     def recent_events(self) -> I64:
         """Events of each cell in the last quarter of a second."""
-        found = np.zeros_like(self._events)
-        _add(self._kept, 1, self._done - SEEN_MS, self._done, found)
-        return found[0] + np.bincount(self._cells_of(self._held), minlength=found.shape[1])
+        oldest = max(self._done - SEEN_MS, 0)
+        found = self._kept[np.arange(oldest, self._done) % KEPT_MS, 0].sum(axis=0, dtype=np.int64)
+        return found + np.bincount(self._cells_of(self._held), minlength=len(found))
 
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
-        before, self._placed = self._placed, at
-        _add(self._kept, 1, before, at, self._events)
-        _add(self._kept, -1, before - SEEN_MS, at - SEEN_MS, self._events)
+        block = at // PLACES_MS
+        if block:
+            # the block that leaves has the place of the next one, and is empty at first
+            self._events += self._blocks[(block - 1) % len(self._blocks)]
+            self._events -= self._blocks[block % len(self._blocks)]
+        self._placed = at
         total, on = self._events
         events = total.copy()
         if self.settings.hot:
             events[list(self.settings.hot)] = 0
         found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
         self._place, self._rest, self._pushed, self._noise, self._cells = found
-        inside = self._place >= 0
-        seen = total[inside].sum()
-        self._unloaded = bool(seen > 0 and 1 - on[inside].sum() / seen >= UNLOADED)
+        placed = self._placed_cells = np.flatnonzero(self._place >= 0)
+        seen = total[placed].sum()
+        self._unloaded = bool(seen > 0 and 1 - on[placed].sum() / seen >= UNLOADED)
         shape = MEMORY_MS + GAP_MS + PLACES_MS, len(self._noise)
         self._counts, self._back = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-        self._placed_cells = np.flatnonzero(inside)
-        self._count_places(at - MEMORY_MS - GAP_MS, at)
+        # single milliseconds only where the memory will begin and end: the sum of the others counts
+        self._count_places(at - MEMORY_MS - GAP_MS, at - MEMORY_MS + PLACES_MS)
+        self._count_places(at - MEMORY_MS + PLACES_MS, at - PLACES_MS, PLACES_MS)
+        self._count_places(at - PLACES_MS, at)
 
-    def _count_places(self, first: int, last: int) -> None:
-        """Count the events of some milliseconds by place: all, and those that are ON."""
+    def _count_places(self, first: int, last: int, step: int = 1) -> None:
+        """Count the events of some milliseconds by place: all, and those that are ON.
+
+        With a step of `PLACES_MS` all events of a block stand in its first millisecond.
+        """
         oldest = self._placed - MEMORY_MS - GAP_MS
+        kept = self._kept if step == 1 else self._blocks
+        cells = self._placed_cells
         for kind, counts in enumerate((self._counts, self._back)[: 1 + self._unloaded]):
-            _count(self._kept, kind, first, last, oldest, self._placed_cells, self._place, counts)
+            _count(kept, kind, first, last, step, oldest, cells, self._place, counts)
 
     def _advance(self, first: int, value: F64) -> None:
         """Write the evidence of the milliseconds from `first` on."""
@@ -343,11 +355,13 @@ def _keep(
     first: int,
     last: int,
     kept: npt.NDArray[np.uint32],
+    blocks: npt.NDArray[np.uint32],
 ) -> None:
     """Count the events of the milliseconds from `first` on, before `last`, in place of the oldest.
 
     Args:
         kept: by millisecond, modulo its length; all events and those that are ON; and cell.
+        blocks: sums of `kept` over `PLACES_MS`, modulo its length.
     """
     for k in range(first, last):
         kept[k % len(kept)] = 0
@@ -356,16 +370,11 @@ def _keep(
         row[0, cell[k]] += 1
         if on[k]:
             row[1, cell[k]] += 1
-
-
-@njit(cache=True, nogil=True)
-def _add(kept: npt.NDArray[np.uint32], sign: int, first: int, last: int, events: I64) -> None:
-    """Add the events of some milliseconds to `events`, or take them away; shapes as of `_keep`."""
-    for ms in range(max(first, 0), last):
-        for kind in range(2):
-            row, to = kept[ms % len(kept), kind], events[kind]
-            for cell in range(len(row)):
-                to[cell] += sign * np.int64(row[cell])
+    for k in range(first, last):
+        block = blocks[k // PLACES_MS % len(blocks)]
+        if k % PLACES_MS == 0:
+            block[:] = 0
+        block += kept[k % len(kept)]
 
 
 @njit(cache=True, nogil=True)
@@ -374,6 +383,7 @@ def _count(
     kind: int,
     first: int,
     last: int,
+    step: int,
     oldest: int,
     cells: I64,
     place: I64,
@@ -382,10 +392,11 @@ def _count(
     """Count the events of some milliseconds by place, the first row of `counts` being `oldest`.
 
     Args:
-        kept: as of `_keep`, and which `kind` of them. cells: that have a place.
+        kept: `kept` or `blocks` as of `_keep`, of `step` milliseconds each, and which `kind` of
+            them. cells: that have a place.
     """
-    for ms in range(max(first, 0), last):
-        row, to = kept[ms % len(kept), kind], counts[ms - oldest]
+    for ms in range(max(first, 0), last, step):
+        row, to = kept[ms // step % len(kept), kind], counts[ms - oldest]
         for cell in cells:
             to[place[cell]] += row[cell]
 
