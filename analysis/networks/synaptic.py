@@ -13,9 +13,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import nn
 
-from sliplab.analysis.networks.network import SPIKING, WEIGHTED
+from sliplab.analysis.networks.network import SPIKING, WEIGHTED, parameters
 from sliplab.analysis.networks.spiking import Trainer, side_by_side
 from sliplab.analysis.networks.spiking_gradients import forward_kept
 from sliplab.analysis.networks.training import Fitted, restore
@@ -108,8 +109,8 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWo
     operations[0] = int((synapses[0][x.cell] * x.count).sum())
     spikes, n = fired.sum(axis=0), len(x)
     always = {
-        name: 0 if getattr(net, name).bias is None else neurons * trainer.steps
-        for name, neurons in zip(WEIGHTED, trainer.layout.neurons, strict=True)
+        name: 0 if getattr(net, name).bias is None else count * trainer.steps
+        for name, count in zip(WEIGHTED, trainer.layout.neurons, strict=True)
     }
     synaptic = {name: int(operations[k]) / n + always[name] for k, name in enumerate(WEIGHTED)}
     dense = {
@@ -117,6 +118,9 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWo
         for k, name in enumerate(WEIGHTED)
     }
     total, all_dense = sum(synaptic.values()), sum(dense.values())
+    neurons, weights = sum(trainer.layout.neurons), parameters(net)
+    size = sum(values.numel() for values in weights.values()) + neurons
+    synapse_weights = torch.cat([weights[f"{name}.weight"].detach().flatten() for name in WEIGHTED])
     return WindowWork(
         synaptic_operations={**synaptic, "all": total},
         dense_multiply_adds={**dense, "all": all_dense},
@@ -128,4 +132,7 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWo
         },
         events=float(x.totals.mean()),
         n=n,
+        footprint_bytes=size * np.dtype(np.float32).itemsize,
+        connection_sparsity=float((synapse_weights == 0).double().mean()),
+        activation_sparsity=1 - int(spikes.sum()) / (n * trainer.steps * neurons),
     )

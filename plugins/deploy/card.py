@@ -9,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.metrics.classification import CLASSES, score
-from sliplab.analysis.networks.activity import Activity
 from sliplab.analysis.networks.training import Fitted
 from sliplab.plugins.deploy.document import CardData, CardModel, ModelCard, ModelFile, SplitFigures
 from sliplab.protocols.shown import plural
-from sliplab.storage.schema.evaluation import Latencies
+from sliplab.storage.schema.evaluation import Latencies, WindowCost, WindowWork
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10
@@ -34,7 +33,7 @@ def model_card(
     file: ModelFile,
     data: CardData,
     splits: Mapping[str, SplitResult],
-    spikes: Activity,
+    work: WindowWork,
     detection: Latencies,
     versions: Mapping[str, str],
     margin: float,
@@ -44,7 +43,7 @@ def model_card(
     Args:
         data: where the samples are from.
         splits: results by split.
-        spikes: over the windows of the test split.
+        work: over the windows of the test split.
         detection: over whole test trials.
         margin: of the margin accuracy, mean spikes.
     """
@@ -73,7 +72,17 @@ def model_card(
         data=data,
         figures=figures,
         margin=margin,
-        activity=spikes.cost(),
+        activity=WindowCost(
+            windows=work.n,
+            events_a_window=work.events,
+            rates=work.rates,
+            synaptic_operations=work.synaptic_operations,
+            dense_multiply_adds={k: int(v) for k, v in work.dense_multiply_adds.items()},
+            share_of_dense=work.share,
+            footprint_bytes=work.footprint_bytes,
+            connection_sparsity=work.connection_sparsity,
+            activation_sparsity=work.activation_sparsity,
+        ),
         detection=detection,
         versions=dict(versions),
         warnings=_warnings(fitted, data, splits),
@@ -164,6 +173,13 @@ def card_markdown(card: ModelCard) -> str:
         f"{percent(spikes.share_of_dense)} of the dense ones; "
         f"{spikes.events_a_window:.0f} events a window.",
     ]
+    if spikes.footprint_bytes is not None:
+        text += [
+            "",
+            f"As NeuroBench counts: footprint {spikes.footprint_bytes:,} bytes, "
+            f"connection sparsity {percent(spikes.connection_sparsity)}, "
+            f"activation sparsity {percent(spikes.activation_sparsity)}.",
+        ]
     text += ["", "## Versions", "", ", ".join(f"{k} {v}" for k, v in card.versions.items())]
     return "\n".join(text) + "\n"
 

@@ -20,7 +20,6 @@ from sliplab.analysis.evaluation.trials import latencies
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
-from sliplab.analysis.networks.activity import activity
 from sliplab.analysis.networks.models import (
     comparison_models,
     rules_of,
@@ -35,6 +34,7 @@ from sliplab.analysis.networks.quantised import (
     quantise,
     quantised_net,
 )
+from sliplab.analysis.networks.synaptic import count_work
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
@@ -191,7 +191,8 @@ def _card(
     detection: Latencies,
     made_from_these: bool,
 ) -> ModelCard:
-    net, engine = training.restore(source.fitted), source.fitted.engine
+    engine, work = source.fitted.engine, count_work(source.fitted, seen.windows)
+    assert work is not None  # `seen` has windows
     kinematic = training_campaigns(source.campaigns)
     splits = {
         split: SplitResult(
@@ -228,7 +229,7 @@ def _card(
         source.about,
         data,
         splits,
-        activity(net, seen.x),
+        work,
         detection,
         versions,
         margin,

@@ -169,6 +169,12 @@ class WindowWork(Part):
     """Input events."""
     n: Int
     """Windows that were counted."""
+    footprint_bytes: Int | None = None
+    """Of weights and potentials, in float32; these three are those of NeuroBench."""
+    connection_sparsity: Number | None = None
+    """Share of the weights that are 0."""
+    activation_sparsity: Number | None = None
+    """Share of the neurons and steps without a spike."""
 
 
 class Baseline(Part):
@@ -645,3 +651,7 @@ class WindowCost(Part):
     dense_multiply_adds: dict[str, Int]
     """Without looking at zeros."""
     share_of_dense: Number
+    footprint_bytes: Int | None = None
+    connection_sparsity: Number | None = None
+    activation_sparsity: Number | None = None
+    """These three: see `WindowWork`."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from sinabs.layers import IAFSqueeze
 from torch import nn
 
 from sliplab.analysis.networks.network import (
@@ -11,6 +12,7 @@ from sliplab.analysis.networks.network import (
     build,
     matrices,
     on_grid,
+    parameters,
     reset_states,
     set_matrices,
     set_weights,
@@ -84,6 +86,13 @@ def test_operations_are_those_of_sinabs_spikes_followed_one_by_one(biases: bool)
     assert found.events == pytest.approx(x.sum() / len(x))
     assert found.share == pytest.approx(every / sum(dense.values()))
     assert found.rates["iaf4"] == pytest.approx(spikes["iaf4"] / (8 * 12))
+    # NeuroBench counts what is 0: weights, and outputs of all spiking layers
+    potentials = sum(layer.v_mem[0].numel() for layer in net if isinstance(layer, IAFSqueeze))
+    stored = sum(values.numel() for values in parameters(net).values())
+    assert found.footprint_bytes == 4 * (potentials + stored)
+    assert found.connection_sparsity == 0
+    silent = 1 - sum(spikes.values()) / (8 * potentials)
+    assert found.activation_sparsity == pytest.approx(silent, rel=1e-12)
 
 
 def _shape_of(layer: nn.Module) -> dict[str, object]:

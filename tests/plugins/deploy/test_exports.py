@@ -16,7 +16,6 @@ from sinabs.activation import MembraneSubtract
 from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
-from sliplab.analysis.networks.activity import activity
 from sliplab.analysis.networks.network import (
     BIASED,
     SPIKING,
@@ -28,7 +27,9 @@ from sliplab.analysis.networks.network import (
     weights,
 )
 from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quantise, quantised_net
+from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
+from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.flows.exports import ExportRequest, export
 from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
 from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
@@ -297,44 +298,15 @@ def layer_outputs(net: nn.Sequential, x: np.ndarray) -> dict[str, torch.Tensor]:
 # -- operations and the card -----------------------------------------------------------------
 
 
-def test_synaptic_operations_are_counted_one_by_one() -> None:
-    net = build(SMALL, TINY, 0)
-    x = sparse(3, TINY, 0, 0.3)
-    found = activity(net, x, batch=2)
-    spikes = {name: value.numpy() for name, value in layer_outputs(net, x).items()}
-    inputs = {
-        "conv1": x.astype(np.float64),
-        "conv2": spikes["iaf1"].reshape(3, 10, SMALL.conv1_channels, 6, 6),
-        "fc1": spikes["iaf2"].reshape(3, 10, -1),
-        "fc2": spikes["iaf3"].reshape(3, 10, -1),
-    }
-    for name, at in inputs.items():
-        layer: Any = getattr(net, name)
-        total, dense = 0.0, 0
-        if name.startswith("fc"):
-            total = (float(at.sum()) + 30) * layer.out_features  # a bias in each of 30 steps
-            dense = 10 * (layer.in_features + 1) * layer.out_features
-        else:
-            (k, _), (s, _), (p, _) = layer.kernel_size, layer.stride, layer.padding
-            outputs = range((6 + 2 * p - k) // s + 1)
-            reach = [sum(0 <= c + p - s * o < k for o in outputs) for c in range(6)]
-            fan = np.outer(reach, reach)
-            total = float((at * fan).sum()) * layer.out_channels
-            dense = 10 * int(fan.sum()) * layer.in_channels * layer.out_channels
-        assert found.operations[name] == pytest.approx(total / 3)
-        assert found.dense[name] == dense
-    assert found.events == pytest.approx(x.sum() / 3)
-    for name in SPIKING:
-        assert found.rates[name] == pytest.approx(spikes[name].mean())
-    reported = found.cost()
-    assert reported.synaptic_operations["all"] == pytest.approx(sum(found.operations.values()))
-
-
 @pytest.mark.parametrize("simulated", [True, False])
 def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
     one = fitted()
     counts = np.array([[5, 0, 0], [0, 5, 0], [0, 0, 5], [1, 1, 0]])
     part = SplitResult(counts, np.array([0, 1, 2, 2]), 4)
+    work = count_net_work(
+        build(SMALL, TINY, 0), TINY.cells, SparseWindows.of(sparse(2, TINY, 0, 0.2))
+    )
+    assert work is not None
     campaign = CardCampaign(
         name="c",
         experiment="kinematic",
@@ -353,7 +325,7 @@ def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
         ModelFile(file="m.pt", sha256="c" * 64),
         data,
         {"test": part},
-        activity(build(SMALL, TINY, 0), sparse(2, TINY, 0, 0.2)),
+        work,
         {},
         {"torch": "1"},
         2.0,
@@ -362,8 +334,12 @@ def test_a_card_says_where_the_data_are_from(simulated: bool) -> None:
     assert json.loads(json.dumps(reported, allow_nan=False)) == reported
     assert reported["model"]["network"] == SMALL.model_dump(mode="json")  # the defaults too
     assert reported["figures"]["test"]["accuracy"]["strict"] == 0.75
+    assert f"footprint {work.footprint_bytes:,} bytes, connection sparsity 0.0 %" in card_markdown(
+        card
+    )
     assert reported["figures"]["test"]["recall"]["gross"] == 0.5
     page = card_markdown(card)
+    assert f"footprint {work.footprint_bytes:,} bytes, connection sparsity 0.0 %" in page
     assert ("simulated" in page) == simulated
     assert "not those that the model was trained on" in page
     assert "only 4 test trials" in page
