@@ -25,6 +25,7 @@ NAMES = (
     "labels_truth",
     "network",
     "live",
+    "tips",
     "orchestration",
     "page",
     "acquisition",

@@ -85,7 +85,8 @@ class AtLevel(StreamDetector):
         slip = np.where(found.label == GROSS, GROSS, INCIPIENT)
         label = np.where(found.value > self.level, slip, NO_SLIP).astype(np.int8)
         t_us = found.t_us + start_us
-        return Evidence(t_us, found.value, label, self._windows(given, t_us.tolist()))
+        windows = self._windows(given, t_us.tolist())
+        return Evidence(t_us, found.value, label, windows, found.slipped)
 
     def close(self) -> None:
         """See `Detector`."""

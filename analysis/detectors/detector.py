@@ -101,12 +101,15 @@ class Evidence:
         value: float64 (n,), evidence for slip, finite or -inf; larger is more.
         label: int8 (n,), 0 no slip, 1 incipient, 2 gross slip; `NO_LABEL` without classes.
         windows: n of them from a `StreamDetector`; others may leave them out.
+        slipped: float64 (n,), share of the tips that have let go, 0 to 1, NaN where unknown; None
+            from a detector that does not know tips.
     """
 
     t_us: npt.NDArray[np.int64]
     value: npt.NDArray[np.float64]
     label: npt.NDArray[np.int8]
     windows: tuple[JudgedWindow, ...] = ()
+    slipped: npt.NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -125,10 +128,12 @@ class Evidence:
         """Return evidence of parts that follow each other."""
         none = Evidence.of([], [])
         every = [none, *parts]
+        slipped = [part.slipped for part in parts if part.slipped is not None]
         return Evidence(
             np.concatenate([part.t_us for part in every]),
             np.concatenate([part.value for part in every]),
             np.concatenate([part.label for part in every]),
+            slipped=np.concatenate(slipped) if slipped and len(slipped) == len(parts) else None,
         )
 
 
@@ -214,6 +219,8 @@ def checked(found: object, before_us: int, until_us: int) -> Evidence:
     if not isinstance(found, Evidence):
         raise DetectorError(f"push returned {type(found).__name__}; must be Evidence")
     n = len(found.t_us)
+    if found.slipped is not None and found.slipped.shape != (n,):
+        raise DetectorError(f"evidence has {n} times and {found.slipped.shape} shares of tips")
     if found.value.shape != (n,) or found.label.shape != (n,):
         raise DetectorError(
             f"evidence has {n} times, {found.value.shape} values and {found.label.shape} labels; "

@@ -43,6 +43,7 @@ class LiveDecision:
         last_event_us: the latest of them; None in a window without events.
         by_event: an event ended the window, and not the clock alone.
         decided_ns: monotonic clock when the decision was there.
+        slipped: share of the tips that have let go; None where it is not known.
     """
 
     number: int
@@ -57,6 +58,7 @@ class LiveDecision:
     last_event_us: int | None
     by_event: bool
     decided_ns: int = field(compare=False)
+    slipped: float | None = None
 
 
 class DecisionJson(TypedDict):
@@ -70,6 +72,7 @@ class DecisionJson(TypedDict):
     state: str
     onset: str | None
     value: float | None
+    slipped: float | None
     counts: list[int] | None
     smoothed: list[float] | None
     events: int
@@ -113,6 +116,7 @@ class TimedDecision:
             "state": self.state,
             "onset": made.onset,
             "value": made.value if math.isfinite(made.value) else None,
+            "slipped": made.slipped,
             "counts": None if made.counts is None else list(made.counts),
             "smoothed": None if made.smoothed is None else list(made.smoothed),
             "events": made.events,
@@ -262,7 +266,7 @@ class LiveDetector:
         decided_ns = time.monotonic_ns()
         if np.isnan(evidence.value).any():
             raise DetectorError("evidence is no number")
-        made = []
+        made, slipped = [], evidence.slipped
         for k, window in enumerate(evidence.windows):
             label, last_us = int(evidence.label[k]), window.last_event_us
             made.append(
@@ -279,6 +283,7 @@ class LiveDetector:
                     last_event_us=None if last_us is None else origin_us + last_us,
                     by_event=by_event,
                     decided_ns=decided_ns,
+                    slipped=None if slipped is None or np.isnan(slipped[k]) else float(slipped[k]),
                 )
             )
         return made

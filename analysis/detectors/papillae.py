@@ -36,18 +36,21 @@ times the others' by odds. Both likelihoods are binomial. The statistic is divid
 alone, not by its square: what pushes all papillae causes ON events.
 
 Evidence is the sum of the two largest statistics of all places from `LEAST` on, since tips let go
-one after the other; 0 below, and while fewer than `fewest_places` of them move.
+one after the other; 0 below, and while fewer than `fewest_places` of them move. From the first
+evidence on, until the skin is unloaded, the share of tips that have let go is known, too
+(`slipped_tips`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.detectors.detector import Cost, Detector, Evidence
+from sliplab.analysis.detectors.slipped_tips import SlippedTips, regions
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
@@ -96,6 +99,13 @@ FEW_ON, OF_SEEN, OF_NOW = 0.05, 100.0, 5.0
 """Share of ON events before anything is seen, and of how many events; weight of those in memory."""
 MOST = 0.95
 """Of a share, so that a place's rate can change."""
+BEFORE_MS, SINCE_MS = 120, 20
+"""Before the first evidence of slip: the time in which the rates of tips that stick are measured.
+"""
+REPLAYED_MS = 30
+"""Before it, for which tips are followed afterwards."""
+TAKEN_BACK_MS = 250
+"""Time without a tip that has probably let go, after which the evidence was a false alarm."""
 PRIOR_DISPERSION = 4.0
 """Before anything is measured: the weight of one measurement."""
 REMAINING_MEAN = 0.1427
@@ -148,6 +158,9 @@ class Papillae(Detector):
         self._cells, self._unloaded = np.zeros(0), False
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
         self._age = np.zeros(3, np.int64)
+        self._tips: SlippedTips | None = None
+        self._tip_of_cells, self._tip_cells = np.full(cells, -1), np.zeros(0, np.int64)
+        self._found_slip, self._last_slid = False, 0
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
@@ -155,7 +168,7 @@ class Papillae(Detector):
         cells = self._cells_of(events)
         ms, on = events.t_us // BIN_US, events.p > 0
         first, last = self._done, int(until_us) // BIN_US
-        value = np.zeros(last - first)
+        value, slipped = np.zeros(last - first), np.zeros(last - first)
         at, done = first, 0
         while at < last:
             if at % PLACES_MS == 0:
@@ -164,11 +177,13 @@ class Papillae(Detector):
             part = slice(done, done := int(np.searchsorted(ms, end)))
             _keep(ms[part], cells[part], on[part], at, end, self._kept, self._blocks)
             self._advance(at, value[at - first : end - first])
+            self._follow_tips(at, slipped[at - first : end - first])
             if end % PLACES_MS == 0:
                 self._measure_dispersion()
             at = end
         self._done, self._held = last, events[done:]
-        return Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
+        found = Evidence.of((np.arange(first, last) + 1) * BIN_US, value)
+        return replace(found, slipped=slipped)
 
     def _cells_of(self, events: EventChunk) -> I64:
         row, column = events.y // self._cell_px, events.x // self._cell_px
@@ -191,6 +206,11 @@ class Papillae(Detector):
     def cell_px(self) -> int:
         """Side of a cell."""
         return self._cell_px
+
+    @property
+    def tips(self) -> SlippedTips | None:
+        """The tips since the first evidence of slip; None before it, and while unloaded."""
+        return self._tips
 
     @property
     def place_of_cells(self) -> I64:
@@ -227,6 +247,38 @@ class Papillae(Detector):
         self._count_places(at - MEMORY_MS - GAP_MS, at - MEMORY_MS + PLACES_MS)
         self._count_places(at - MEMORY_MS + PLACES_MS, at - PLACES_MS, PLACES_MS)
         self._count_places(at - PLACES_MS, at)
+        if self._tips is not None:
+            if (self._tips.probability > 0.5).any():
+                self._last_slid = at
+            if self._unloaded or at - self._last_slid > TAKEN_BACK_MS:
+                self._tips = None
+        if self._tips is None and self._found_slip and len(self._rest) and not self._unloaded:
+            self._begin_tips(at)
+        self._found_slip = False
+
+    def _begin_tips(self, at: int) -> None:
+        """Begin to follow the tips of the present places, from a little before."""
+        self._tip_of_cells = regions(self._place, self._shape[1])
+        self._tip_cells = np.flatnonzero(self._tip_of_cells >= 0)
+        cells = np.bincount(self._tip_of_cells[self._tip_cells])
+        rate = self._count_tips(at - BEFORE_MS, at - SINCE_MS).mean(axis=0)
+        self._tips = SlippedTips(rate, cells * (self._noise[0] / self._cells[0]))
+        self._tips.push(self._count_tips(at - REPLAYED_MS, at))
+        self._last_slid = at
+
+    def _count_tips(self, first: int, last: int) -> I64:
+        """Return the events by millisecond and tip."""
+        tip = self._tip_of_cells
+        counts = np.zeros((last - first, tip.max() + 1), np.int64)
+        _count(self._kept, 0, first, last, 1, first, self._tip_cells, tip, counts)
+        return counts
+
+    def _follow_tips(self, first: int, slipped: F64) -> None:
+        """Write the share of the tips that have let go, in the milliseconds from `first` on."""
+        if self._unloaded:
+            slipped[:] = np.nan
+        elif self._tips is not None:
+            slipped[:] = self._tips.push(self._count_tips(first, first + len(slipped)))
 
     def _count_places(self, first: int, last: int, step: int = 1) -> None:
         """Count the events of some milliseconds by place: all, and those that are ON.
@@ -256,6 +308,7 @@ class Papillae(Detector):
             _advance_unloaded(counts, back, noise, self._cells, pushed, scale, fewest, value)
         else:
             _advance(counts, noise, rest, pushed, self._age, scale**2, fewest, value)
+        self._found_slip |= bool(value.any())
 
     def _dispersion(self) -> float:
         """Return how much more the shares vary than by chance, at least 1."""

@@ -90,6 +90,10 @@ class DetectView:
             filled = min(WIDTH, round(WIDTH * mean / (self._most or 1)))
             bar = Text("█" * filled + "·" * (WIDTH - filled), style=_STYLES[number])
             table.add_row(name.replace("_", " "), bar, f"{mean:5.2f}")
+        slipped = None if timed is None else timed.decision.slipped
+        if slipped is not None:
+            bar = Text("█" * round(WIDTH * slipped) + "·" * (WIDTH - round(WIDTH * slipped)))
+            table.add_row("tips slipped", bar, f"{100 * slipped:3.0f} %")
         if timed is None:
             return Group(Text(self._title), table, Text("no window yet"))
         span_us = sum(part[0] for part in self._rate)
@@ -106,6 +110,8 @@ def _line(timed: TimedDecision) -> str:
     said = f"evidence {made.value:.3g}"
     if made.counts is not None:
         said = f"spikes {'/'.join(str(count) for count in made.counts)}"
+    if made.slipped is not None:
+        said += f", {100 * made.slipped:.0f} % of the tips slipped"
     late = "" if timed.latency_ms is None else f", {timed.latency_ms:.1f} ms after its last event"
     onset = f"; first {made.onset}" if made.onset else ""
     phase = f" ({timed.phase})" if timed.phase else ""

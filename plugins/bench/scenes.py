@@ -209,19 +209,23 @@ def simulated(drawn: SceneDraw) -> Scene:
     Raises:
         RigError: nothing slips in it.
     """
-    taken = take(drawn)
-    done, truth = taken.done, taken.truth
-    begin_ns, end_ns = done.recorded_ns
+    return scene_of_trial(drawn, take(drawn))
+
+
+def since_us(taken: Taken, onset_ns: int) -> int:
+    """Return microseconds from the begin of a scene to an onset of its truth."""
+    moved_ns = next(step.start_ns for step, _ in taken.done.steps if step.phase == "slide")
+    return (onset_ns - taken.truth["reference_ns"] + moved_ns - taken.done.recorded_ns[0]) // 1000
+
+
+def scene_of_trial(drawn: SceneDraw, taken: Taken) -> Scene:
+    """Return the scene that a simulated trial is."""
+    truth = taken.truth
+    begin_ns, end_ns = taken.done.recorded_ns
     end_us = (end_ns - begin_ns) // 1000
-    moved_ns = next(step.start_ns for step, _ in done.steps if step.phase == "slide")
-
-    def since(onset_ns: int | None) -> int:
-        """Return microseconds since the scene began; its end for what never came."""
-        if onset_ns is None:
-            return end_us
-        return min((onset_ns - truth["reference_ns"] + moved_ns - begin_ns) // 1000, end_us)
-
-    slip = Slip(*(since(truth[key]) for key in ("first_slip_ns", "incipient_ns", "gross_ns")))
+    onsets = (truth[key] for key in ("first_slip_ns", "incipient_ns", "gross_ns"))
+    # what never came has the end
+    slip = Slip(*(end_us if ns is None else min(since_us(taken, ns), end_us) for ns in onsets))
     end_us = min(end_us, slip.gross_us + AFTER_GROSS_US)
     events = taken.sink.taken("events", EventChunk)
     t_us = events.t_us - begin_ns // 1000
