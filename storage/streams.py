@@ -100,6 +100,9 @@ READS = StreamKind(
     },
     camera="frames",
 )
+_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
+CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
+"""Readings of a recorded stream's clock; it may fall back. """
 TRIGGERS = StreamKind(
     "triggers",
     {

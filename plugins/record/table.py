@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.streams import READS, SCALAR, Chunk, Column, ScalarChunk, StreamKind
+from sliplab.storage.streams import SCALAR, Chunk, Column, ScalarChunk, StreamKind
 
 _COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
-_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
-CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
-"""Readings of a stream's clock: its time, and between which two times of the host that was."""
+PULSES = ("state", "level", "harp", "id")
+"""Columns of a stream that sees pulses: a line's levels, a Harp clock's levels, or barcodes."""
+MOST_NS = 2**62
+"""Times beyond are none: the difference of two would not fit into int64."""
 
 
 def table_kind(columns: Mapping[str, str]) -> StreamKind:
