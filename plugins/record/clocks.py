@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.analysis.clocks.synchronise import (
     ClockInput,
     clocks_in,
@@ -69,19 +68,21 @@ def fit_clocks(
         tap, taps_ns: see `plugins.record.tapped`. pulses: see `plugins.record.pulsed`.
     """
     result = _fitted(folder, sources, span_ns)
+    known = result.found
     with StreamReader(folder / DATA) as reader:
-        for names in (tap, pulses):
-            if names is None or not result.found.keys() >= set(names):
-                continue
+        if tap is not None and known.keys() >= set(tap):
             try:
-                if names is tap:
-                    found = clock_by_taps(reader, tap, sources[tap[0]], result.found, taps_ns)
-                    result.found[tap[0]] = found
-                else:
-                    result.found.update(clocks_by_pulses(reader, names, result.found))
-            except (NoMatchError, ValueError) as error:
-                how = "taps" if names is tap else "pulses"
-                result.common.append(f"the clock of {names[0]} by {how}: {error}")
+                known[tap[0]] = clock_by_taps(reader, tap, sources[tap[0]], known, taps_ns)
+            except ValueError as error:
+                result.common.append(f"the clock of {tap[0]} by taps: {error}")
+        # which also time a clock that its arrivals could not bound
+        if pulses is not None and pulses[0] in sources and pulses[1] in known:
+            shared = (name for name in pulses[2:] if name in known)
+            try:
+                known.update(clocks_by_pulses(reader, (*pulses[:2], *shared), known))
+                result.refused.pop(pulses[0], None)
+            except ValueError as error:
+                result.common.append(f"the clock of {pulses[0]} by pulses: {error}")
     return result
 
 

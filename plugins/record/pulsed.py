@@ -27,7 +27,7 @@ def clocks_by_pulses(
 
     Args:
         names: of streams that saw the same pulses; from the third on, those of the first's clock.
-        known: clocks by other means, of all.
+        known: clocks by other means, of all but perhaps the first.
 
     Raises:
         ValueError: no map can be trusted, or it contradicts what is known by other means.
@@ -44,13 +44,15 @@ def clocks_by_pulses(
     result = {}
     for name in (names[0], *names[2:]):
         t_ns = reader.column(f"{STREAM_GROUP}/{name}/t")
+        if np.any(np.diff(t_ns) < 0):
+            raise ValueError(f"the times of {name} fall back")
         at = np.unique(np.linspace(0, t_ns[-1] - t_ns[0], _KNOTS).astype(np.int64)) + t_ns[0]
         times = found.map(at)
         if not times.known.all():
             raise ValueError(f"pulses do not cover {name}")
         more = round(error_ns + own_half + other_half)
         about = {"grade": PULSE, "kind": "95 %", "pairs": found.stretches[0].events}
-        result[name] = closer(known[name], at, times.low_ns - more, times.high_ns + more, about)
+        result[name] = closer(known.get(name), at, times.low_ns - more, times.high_ns + more, about)
     return result
 
 

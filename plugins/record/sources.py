@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
-from sliplab.plugins.record.table import chunk_type, rows
+from sliplab.plugins.record.table import rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.timing import WIRED, StreamGrade, StreamTiming
@@ -47,6 +47,7 @@ from sliplab.storage.streams import (
     ScalarChunk,
     Sink,
     WrenchChunk,
+    chunk_type,
 )
 
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"

@@ -82,12 +82,12 @@ def known_error_ns(name: str, clock: DeviceRecord) -> int:
 
 
 def closer(
-    first: DeviceRecord, at: I64, least: I64, most: I64, about: Mapping[str, Any]
+    first: DeviceRecord | None, at: I64, least: I64, most: I64, about: Mapping[str, Any]
 ) -> DeviceRecord:
     """Return the clock by common events, or the one known by other means if that is closer.
 
     Args:
-        first: the clock by other means.
+        first: the clock by other means, if it is known.
         at, least, most: (n,) times of the clock, and between which times on the host's they lie.
         about: what the record says of the clock by common events.
 
@@ -95,14 +95,16 @@ def closer(
         NoMatchError: they contradict each other.
     """
     middle, half = least + (most - least) // 2, float((most - least).max()) / 2 + 1
-    off = np.abs(middle - first.map.to_reference(at)).max()
-    if off > half + (first.uncertainty_ns or 0):
-        raise NoMatchError(
-            "no_match",
-            f"it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
-        )
-    if half >= (first.uncertainty_ns or np.inf):
-        return first
+    if first is not None:
+        known = first.uncertainty_ns or 0
+        off = np.abs(middle - first.map.to_reference(at)).max()
+        if off > half + known:
+            raise NoMatchError(
+                "no_match",
+                f"it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
+            )
+        if half >= (first.uncertainty_ns or np.inf):
+            return first
     line: Any = ClockMap.through(at.tolist(), middle.tolist())
     return DeviceRecord(map=line, uncertainty_ns=half, **about)
 

@@ -265,6 +265,10 @@ class RowFile:
         """Return the unit of a named stream; ``""`` where it says none."""
         return _text(self._group(f"{STREAM_GROUP}/{name}"), UNIT_ATTRIBUTE)
 
+    def column_unit(self, name: str) -> str:
+        """Return the unit of a column by its name in the file; ``""`` where it says none."""
+        return _text(h5py.h5o.open(self._file, self._place(name)), UNIT_ATTRIBUTE)
+
     def has(self, name: str) -> bool:
         """Return whether there is a column of this name, or something that cannot be read."""
         if name in self._opened:
@@ -776,6 +780,10 @@ class StreamReader:
         parts = self.parts(name)
         rows = self._group(f"{STREAM_GROUP}/{name}", *parts)
         return {part: column.read() for part, column in zip(parts, rows, strict=True)}
+
+    def column_unit(self, name: str) -> str:
+        """Return the unit of a column by its name in the file; ``""`` where it says none."""
+        return self._file.column_unit(name)
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""
