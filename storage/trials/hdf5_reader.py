@@ -265,9 +265,14 @@ class RowFile:
         """Return the unit of a named stream; ``""`` where it says none."""
         return _text(self._group(f"{STREAM_GROUP}/{name}"), UNIT_ATTRIBUTE)
 
-    def column_unit(self, name: str) -> str:
-        """Return the unit of a column by its name in the file; ``""`` where it says none."""
-        return _text(h5py.h5o.open(self._file, self._place(name)), UNIT_ATTRIBUTE)
+    def column_unit(self, name: str, part: str) -> str:
+        """Return the unit of a column of a named stream; ``""`` where it says none."""
+        kind = self.kind(group := f"{STREAM_GROUP}/{name}")
+        if kind == SCALAR.name and part == "value":
+            return self.unit(name)
+        if kind in STREAMS:
+            return STREAMS[kind].columns[part].unit
+        return _text(self._group(group), f"{UNIT_ATTRIBUTE}_{part}")
 
     def has(self, name: str) -> bool:
         """Return whether there is a column of this name, or something that cannot be read."""
@@ -781,9 +786,9 @@ class StreamReader:
         rows = self._group(f"{STREAM_GROUP}/{name}", *parts)
         return {part: column.read() for part, column in zip(parts, rows, strict=True)}
 
-    def column_unit(self, name: str) -> str:
-        """Return the unit of a column by its name in the file; ``""`` where it says none."""
-        return self._file.column_unit(name)
+    def column_unit(self, name: str, part: str) -> str:
+        """Return the unit of a column of a named stream; ``""`` where it says none."""
+        return self._file.column_unit(name, part)
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""

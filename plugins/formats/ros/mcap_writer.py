@@ -25,7 +25,6 @@ from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
     I64,
-    SCALAR,
     EventChunk,
     Json,
 )
@@ -281,7 +280,7 @@ class _Trial:
     def _table(self, name: str) -> Iterator[Message]:
         with self.recording.open() as reader:
             columns = reader.stream(name)
-            units = {part: reader.column_unit(f"{STREAM_GROUP}/{name}/{part}") for part in columns}
+            units = {part: reader.column_unit(name, part) for part in columns}
         times = self._line(name, columns["t"]).tolist()
         shown = [part for part, values in columns.items() if values.dtype == np.float64]
         channels = [self._channel(f"/{name}/{part}", ros2.SCALAR) for part in shown]
@@ -350,12 +349,9 @@ def _column_units(reader: StreamReader) -> dict[str, str]:
         for name, column in known.items()
         if counts[name] and not name.startswith("events/")
     }
-    for name, kind in reader.streams().items():
+    for name in reader.streams():
         for part in reader.parts(name):
-            path = f"{STREAM_GROUP}/{name}/{part}"
-            found[path] = reader.column_unit(path)
-            if kind == SCALAR.name and part == "value":
-                found[path] = reader.scalars(name).unit
+            found[f"{STREAM_GROUP}/{name}/{part}"] = reader.column_unit(name, part)
     return found
 
 

@@ -367,7 +367,7 @@ def test_a_recorded_campaign_comes_back_with_its_tables(tmp_path: Path) -> None:
     assert_equal(ours, theirs)
     (again,) = theirs.campaign("c").recordings()
     with again.open() as reader:
-        assert reader.column_unit("streams/pull/fx") == "N"
+        assert reader.column_unit("pull", "fx") == "N"
 
 
 def waited_for(trial: RecordedTrial, name: str, rows: int) -> None:
