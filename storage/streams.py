@@ -192,7 +192,7 @@ def chunk_type(kind: StreamKind) -> type[Chunk]:
 def _chunk_type(name: str, columns: tuple[tuple[str, Column], ...]) -> type[Chunk]:
     kind = StreamKind(name, dict(columns))
     fields = [(column.field, np.ndarray) for _, column in columns]
-    made: Any = make_dataclass(
+    made: type[Chunk] = make_dataclass(
         "TableChunk", fields, bases=(Chunk,), namespace={"KIND": kind}, frozen=True
     )
     return made

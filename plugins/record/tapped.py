@@ -70,8 +70,8 @@ def clock_by_taps(
     timing = about.record.timing or StreamTiming()
     found = map_by_taps(own, Taps(low - error, high + error), timing.drift_ppm + HOST_PPM)
     ends = np.array([own_ns[0], own_ns[-1]])
-    about = {"grade": TAP, "kind": "hard bound", "pairs": found.taps}
-    return closer(first, ends, *found.bounds(ends), about)
+    said = {"grade": TAP, "kind": "hard bound", "pairs": found.taps}
+    return closer(first, ends, *found.bounds(ends), said)
 
 
 def known_error_ns(name: str, clock: DeviceRecord) -> int:
