@@ -13,7 +13,7 @@ from sliplab.storage.streams import SCALAR, Chunk, Column, ScalarChunk, StreamKi
 
 _COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
-PULSES = ("state", "level", "harp", "id")
+PULSES = ("state", "harp", "id")
 """Columns of a stream that sees pulses: a line's levels, a Harp clock's levels, or barcodes."""
 MOST_NS = 2**62
 """Times beyond are none: the difference of two would not fit into int64."""

@@ -21,6 +21,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from scipy.spatial.transform import Rotation
 
+from sliplab.flows.api import open_store
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.plugins.formats.ros.mcap_writer import write_mcap
 from sliplab.plugins.publish.forms import publish
@@ -357,6 +358,9 @@ def test_a_recorded_campaign_comes_back_with_its_tables(tmp_path: Path) -> None:
     ours = Store.open(tmp_path / "store")
     (found,) = ours.campaign("c").recordings()
     assert "wrong" in found.clocks.refused
+    arrays = open_store(tmp_path / "store").trial(trial.id).to_dict()
+    assert arrays["data_vars"]["pull_fy"]["data"].tolist() == [0, -1, -2, -3, -4]
+    assert "wrong_t_ns" not in arrays["coords"]
     publish(publication(ours), tmp_path / "out", "mcap")
     (file,) = (tmp_path / "out").rglob("*.mcap")
     with file.open("rb") as handle:

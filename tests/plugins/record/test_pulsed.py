@@ -31,7 +31,7 @@ def edges(how: str, rng: np.random.Generator) -> tuple[I64, F64]:
     if how == "state":
         both = np.stack([rises, rises + 20 * BIT_NS], 1).ravel()
         return both, np.tile([1.0, 0.0], PULSES)
-    if how == "level":  # sampled
+    if how == "sampled":
         at = np.arange(0, rises[-1] + 50 * BIT_NS, BIT_NS // 2)
         since = at - rises[np.maximum(np.searchsorted(rises, at, side="right") - 1, 0)]
         return at, ((since >= 0) & (since < 20 * BIT_NS)).astype(float)
@@ -53,9 +53,10 @@ def recorded(folder: Path, how: str, seeds: tuple[int, int], stated_ms: float | 
     """Record pulses that a DAQ with a clock of its own and a box saw, and a sensor of the DAQ."""
     rng = np.random.default_rng(9)
     own, box = (edges(how, np.random.default_rng(seed)) for seed in seeds)
+    columns = {"state" if how == "sampled" else how: ""}
     sources = [
-        push("daq", {how: ""}, clock="own"),
-        push("box", {how: ""}, uncertainty_ms=stated_ms),
+        push("daq", columns, clock="own"),
+        push("box", columns, uncertainty_ms=stated_ms),
         push("glove", {"pull": "N"}, clock="own"),
     ]
     with (
@@ -80,7 +81,7 @@ def recorded(folder: Path, how: str, seeds: tuple[int, int], stated_ms: float | 
     return recording
 
 
-@pytest.mark.parametrize("how", ["state", "level", "id", "harp"])
+@pytest.mark.parametrize("how", ["state", "sampled", "id", "harp"])
 def test_pulses_time_a_stream_and_what_shares_its_clock(tmp_path: Path, how: str) -> None:
     found = recorded(tmp_path, how, (3, 3), 0.1)
     (mark,) = found.record.imported.marks
