@@ -152,3 +152,28 @@ def test_lines_with_wrong_stamps_of_a_shared_clock(tmp_path: Path, wrong: str) -
     assert ("g" in recording.clocks.streams) == (wrong in {"nan_once", "infinite_once"})
     if wrong in {"back", "tai", "constant"}:
         assert recording.clocks.refused["g"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("wrong", ["back_in_mid_trial", "ahead_in_mid_trial", "tai_for_utc"])
+def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
+    tmp_path: Path, wrong: str
+) -> None:
+    """A file of events is in the order of time, so that what falls back cannot be stored."""
+    source = push("events", events_px=(64, 48), clock="ptp", uncertainty_ms=STATED_MS)
+    first = time.clock_gettime_ns(SHARED["ptp"])
+    with record([source], tmp_path, "stamps") as recorder, recorder.trial() as trial:
+        for k in range(STEPS):
+            threading.Event().wait(STEP_S)  # the camera's period
+            t_ns = STAMPS[wrong](time.clock_gettime_ns(SHARED["ptp"]), first, k)
+            trial.push("events", t_ns // 1000, 1, 2, 1)
+    assert verify(str(tmp_path))["ok"]
+    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    about = recording.record.imported
+    lost = sum((about.dropped or {}).values())
+    assert recording.record.counts.events + lost == STEPS
+    if wrong == "back_in_mid_trial":
+        assert lost == STEPS - STEPS // 2 - 1
+    else:
+        assert "events" in recording.clocks.refused
+        assert not recording.record.quality.passed
