@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _COMMAND_CHARACTERS = 300
 _STARTED = 19
 """Field of /proc/PID/stat after the name: when it started, ticks since the machine did."""
+_USED = 11
+"""Fields for the time that it used, in user mode and in the kernel."""
 _OF_TERMINAL = signal.SIGINT, signal.SIGHUP
 """Signals that a terminal sends to all of its processes."""
 _F_SETSIG = 10
@@ -70,6 +72,15 @@ def started_ticks(pid: int) -> int | None:
         return None if fields[0] in {"Z", "X"} else int(fields[_STARTED])
     except (OSError, ValueError, IndexError):
         return None
+
+
+def used_s(pid: int) -> float:
+    """Return the processor time that a process has used, s; 0 if it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[_USED]) + int(fields[_USED + 1])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return 0.0
 
 
 def is_here(who: Json) -> bool:

@@ -8,7 +8,8 @@ later (docs/decisions/time.md). All times are int64.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
+from functools import cache
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -100,6 +101,9 @@ READS = StreamKind(
     },
     camera="frames",
 )
+_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
+CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
+"""Readings of a recorded stream's clock; it may fall back. """
 TRIGGERS = StreamKind(
     "triggers",
     {
@@ -177,6 +181,21 @@ class Chunk:
         """Return a chunk without rows."""
         columns = cls.KIND.columns
         return cls.from_columns({k: np.empty((0, *c.shape), c.dtype) for k, c in columns.items()})
+
+
+def chunk_type(kind: StreamKind) -> type[Chunk]:
+    """Return the type of a kind's chunks, with an array for each column."""
+    return _chunk_type(kind.name, tuple(kind.columns.items()))
+
+
+@cache
+def _chunk_type(name: str, columns: tuple[tuple[str, Column], ...]) -> type[Chunk]:
+    kind = StreamKind(name, dict(columns))
+    fields = [(column.field, np.ndarray) for _, column in columns]
+    made: type[Chunk] = make_dataclass(
+        "TableChunk", fields, bases=(Chunk,), namespace={"KIND": kind}, frozen=True
+    )
+    return made
 
 
 @dataclass(frozen=True)

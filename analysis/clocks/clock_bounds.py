@@ -21,6 +21,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 MIN_PAIRS = 3
+MOST_YEARS = 100
 
 
 class BoundsContradictError(ValueError):
@@ -74,7 +75,11 @@ def fit_bounds(
         raise BoundsContradictError(
             f"{int((low > high).sum())} of {device.size} instants have an earliest time after "
             f"their latest, by {int((low - high).max()) / 1e3:g} us at most; none may: "
-            "check the delays in the rig file, and that nothing sets the host's clock"
+            "check the stated delays, and that nothing sets the host's clock"
+        )
+    if (years := (int(device.max()) - int(device.min())) / 3.15576e16) > MOST_YEARS:
+        raise BoundsContradictError(
+            f"its times lie {years:.0f} years apart: are they of one clock?"
         )
     origin, image = int(device.min()), int(low[0])
     widest, slowest = int((high - low).max()), int(np.ptp(high - device))
@@ -102,10 +107,10 @@ def fit_bounds(
             if found.status != 0:
                 raise BoundsContradictError(
                     f"no clock that drifts by at most {max_drift_ppm:g} ppm lies between the "
-                    f"bounds of all {device.size} instants: it jumped, or a message took longer "
-                    f"than the rig file says. The slowest message took {slowest / 1e3:.0f} us more "
-                    f"than the fastest, the bounds allow {widest / 1e3:.0f} us. Let nothing set a "
-                    "clock, or raise drift_ppm or the longest delay"
+                    f"bounds of all {device.size} instants; the best one misses some by "
+                    f"{_missed_us(rows, limits, drift):.0f} us: it jumped or was set, its times "
+                    "are of another clock, or a message took longer than is stated. Let nothing "
+                    "set a clock, or raise drift_ppm or the longest delay"
                 )
             ends.append(sign * float(found.fun))
         ranges.append((0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])))
@@ -121,6 +126,15 @@ def fit_bounds(
         widest_ns=widest,
         slowest_ns=slowest,
     )
+
+
+def _missed_us(rows: Floats, limits: Floats, drift: tuple[float, float]) -> float:
+    """Return by how much every line with an allowed drift misses a bound, us."""
+    wider = np.column_stack([rows, -np.ones(len(rows))])
+    found = optimize.linprog(
+        (0.0, 0.0, 1.0), A_ub=wider, b_ub=limits, bounds=((None, None), drift, (0.0, None))
+    )
+    return float("nan") if found.status != 0 else float(found.fun)
 
 
 def _upper_hull(x: Floats, y: Floats) -> Ints:

@@ -283,8 +283,8 @@ class Trial:
         """The trial as ``xarray.Dataset.from_dict`` takes it: every stream but the video's frames.
 
         Each stream has a dimension of its name, with its times in ``NAME_t_ns``; units are in the
-        names. Attributes are the trial's condition and context, its onsets where it is labelled,
-        and whether it is simulated.
+        names. Streams without a clock are left out. Attributes are the trial's condition and
+        context, its onsets where it is labelled, and whether it is simulated.
 
         Raises:
             StoreError: the trial is damaged.
@@ -292,15 +292,17 @@ class Trial:
         counts = self.recording.record.counts
         data: Json = {}
 
-        def add(stream: str, time_ns: I64, attrs: Json | None = None, **columns: Any) -> None:
+        def add(stream: str, time_ns: I64, attrs: Any = None, /, **columns: Any) -> None:
             coords[f"{stream}_t_ns"] = {"dims": (stream,), "data": time_ns, "attrs": {}}
             for name, values in columns.items():
                 dims = (stream, f"{stream}_{name}_axis")[: values.ndim]
                 data[f"{stream}_{name}"] = {"dims": dims, "data": values, "attrs": attrs or {}}
 
         coords: Json = {}
-        streams = self.streams()
-        for name, kind in streams.items():
+        known = self.recording.clocks.devices()
+        for name, kind in self.streams().items():
+            if name not in known:
+                continue
             if kind == "events":
                 events = self.events(stream=name)
                 add(name, events.t_ns, x=events.x, y=events.y, p=events.p)
@@ -310,8 +312,9 @@ class Trial:
                 forces = self.forces(name)
                 add(name, forces.t_ns, force_n=forces.force_n)
             else:
-                readings = self.scalars(name)
-                add(name, readings.t_ns, {"unit": readings.unit}, value=readings.value)
+                columns = self.recording.samples(name)
+                unit = self.recording.record.streams[name].unit
+                add(name, columns.pop("t"), unit and {"unit": unit}, **columns)
         if counts.poses:
             poses = self.poses()
             add("poses", poses.t_ns, xyz_mm=poses.xyz_mm, rotvec_deg=poses.rotvec_deg)

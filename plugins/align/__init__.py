@@ -4,4 +4,7 @@ from __future__ import annotations
 
 from sliplab.protocols.plugin import Plugin
 
-PLUGIN = Plugin(commands={"align": "sliplab.plugins.align.command:app"})
+PLUGIN = Plugin(
+    commands={"align": "sliplab.plugins.align.command:app"},
+    hooks={"align": "sliplab.plugins.align.align:align"},
+)

@@ -90,8 +90,10 @@ def align_(
         raise InputError("--out", "", str(out), "needs --map, the times to map")
     if times is not None and out is None:
         raise InputError("--map", "", str(times), "needs --out, the file to write")
-    if taps and (harp or b == "harp"):
+    if taps and harp:
         raise InputError("--taps", "", True, "goes without --harp")
+    if taps and b == "harp":
+        raise InputError("B.csv", "", b, "must be a file with a signal: --taps finds taps in it")
     if out is not None and not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")
     for given in (a, b, times):

@@ -96,7 +96,9 @@ def _signal(source: Any, name: str, unit: str | None) -> tuple[Ints, Floats]:
         raise InputError(name, "values", values.shape, f"must have {len(t_ns)} rows, one a time")
     if np.any(np.diff(t_ns) < 0):
         k = int(np.flatnonzero(np.diff(t_ns) < 0)[0]) + 1
-        raise InputError(name, f"sample {k + 1}", int(t_ns[k]), "falls back behind the one before")
+        raise InputError(
+            name, f"sample {k + 1}", f"{t_ns[k] / 1e9:.9g} s", "falls back behind the one before"
+        )
     if not np.isfinite(values).all():
         k = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
         raise InputError(name, f"sample {k + 1}", "", "must be finite numbers")

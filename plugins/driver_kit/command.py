@@ -52,8 +52,10 @@ def driver(
 
     kinds = [part.strip() for part in kind.split(",")]
     for one in kinds:
-        if one not in KINDS or kinds.count(one) > 1:
-            raise InputError("--kind", "", one, one_of(one, KINDS) + ", each once")
+        if one not in KINDS:
+            raise InputError("--kind", "", one, one_of(one, KINDS))
+        if kinds.count(one) > 1:
+            raise InputError("--kind", "", kind, f"must name {one} once")
     drivers = driver_names(name, kinds)
     for driver_name in drivers:
         if fault := name_fault(driver_name):

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.analysis.clocks.synchronise import (
     ClockInput,
     clocks_in,
     streams_of,
     synchronise,
 )
+from sliplab.plugins.record.pulsed import clocks_by_pulses
 from sliplab.plugins.record.sources import (
     CLOCK_STREAM,
     FIRST_CAMERAS,
@@ -28,24 +28,28 @@ from sliplab.plugins.record.sources import (
     TIMING,
     SourceAbout,
 )
-from sliplab.plugins.record.table import CLOCK
 from sliplab.plugins.record.tapped import clock_by_taps
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema.trial import DeviceRecord
-from sliplab.storage.streams import ClockReads
+from sliplab.storage.streams import CLOCK, ClockReads
 from sliplab.storage.trials.checksums import DATA
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
+from sliplab.storage.trials.verify import runs_backwards
+
+AHEAD_NS = 1_000_000_000
+"""How long after they came times of the host's clock may lie where no error is stated."""
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """Maps onto the host's clock by stream, why others have none, and why there is none by taps."""
+    """Maps onto the host's clock by stream, why others have none, and why there is none by taps
+    or pulses."""
 
     found: dict[str, DeviceRecord] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    tap: str = ""
+    common: list[str] = field(default_factory=list)
 
 
 def fit_clocks(
@@ -54,30 +58,41 @@ def fit_clocks(
     span_ns: tuple[int, int],
     tap: tuple[str, str] | None = None,
     taps_ns: Sequence[int] = (),
+    pulses: tuple[str, ...] | None = None,
 ) -> Clocks:
     """Fit the clocks of a sealed trial.
 
     Args:
         sources: streams that have rows.
         span_ns: begin and end of the trial on the host's clock.
-        tap, taps_ns: see `plugins.record.tapped`.
+        tap, taps_ns: see `plugins.record.tapped`. pulses: see `plugins.record.pulsed`.
     """
     result = _fitted(folder, sources, span_ns)
-    if tap is None or not result.found.keys() >= set(tap):
-        return result
+    known = result.found
     with StreamReader(folder / DATA) as reader:
-        try:
-            found = clock_by_taps(reader, tap, sources[tap[0]], result.found, taps_ns)
-            return replace(result, found={**result.found, tap[0]: found})
-        except (NoMatchError, ValueError) as error:
-            return replace(result, tap=str(error))
+        if tap is not None and known.keys() >= set(tap):
+            try:
+                known[tap[0]] = clock_by_taps(reader, tap, sources[tap[0]], known, taps_ns)
+            except ValueError as error:
+                result.common.append(f"the clock of {tap[0]} by taps: {error}")
+        # which also time a clock that its arrivals could not bound
+        if pulses is not None and pulses[0] in sources and pulses[1] in known:
+            shared = (name for name in pulses[2:] if name in known)
+            try:
+                known.update(clocks_by_pulses(reader, (*pulses[:2], *shared), known))
+                result.refused.pop(pulses[0], None)
+            except ValueError as error:
+                result.common.append(f"the clock of {pulses[0]} by pulses: {error}")
+    return result
 
 
 def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int, int]) -> Clocks:
     result = Clocks()
     timed = {}
     for name, source in sources.items():
-        if source.clock == HOST:
+        if (wrong := _wrong_times(folder, name, source, span_ns)) is not None:
+            result.refused[name] = wrong
+        elif source.clock == HOST:
             error = source.uncertainty_ns
             result.found[name] = DeviceRecord(grade=HOST, map=IDENTITY, uncertainty_ns=error)
         else:
@@ -117,6 +132,30 @@ def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int
             changed["uncertainty_ns"] += source.uncertainty_ns or 0.0
         result.found[name] = record.model_copy(update=changed)
     return result
+
+
+def _wrong_times(
+    folder: Path, name: str, source: SourceAbout, span_ns: tuple[int, int]
+) -> str | None:
+    """Return why a sensor's times cannot be right whatever its clock; None if they can."""
+    if source.record.of_camera:  # whose times do not fall back: late rows are left out
+        return None
+    t, host = (f"{STREAM_GROUP}/{name}/{part}" for part in ("t", "host"))
+    with StreamReader(folder / DATA) as reader:
+        if runs_backwards(reader, t):
+            return "its times fall back: the clock was set, or several clocks stamped the rows"
+        if source.clock != HOST:
+            return None
+        parts = zip(reader.column_parts(t), reader.column_parts(host), strict=True)
+        found = [(int((own - came).max()), int(own[-1])) for own, came in parts]
+    ahead_ns, newest_ns = np.max(found, axis=0).tolist()
+    most_ns = AHEAD_NS if source.uncertainty_ns is None else source.uncertainty_ns
+    if ahead_ns > most_ns:
+        return f"its times lie up to {ahead_ns / 1e9:.6f} s after they came"
+    if newest_ns < span_ns[0] - most_ns:
+        before_s = (span_ns[0] - newest_ns) / 1e9
+        return f"all its times lie before the trial, by {before_s:.6f} s at least"
+    return None
 
 
 def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:

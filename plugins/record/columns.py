@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from pydantic import Field
 
-from sliplab.plugins.record.table import rows, table_kind
+from sliplab.plugins.record.table import MOST_NS, rows, table_kind
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.later import need
@@ -172,15 +172,21 @@ class ColumnsSensor:
 
     def _add(self, values: Any, host_ns: int) -> None:
         settings = self._settings
+        times: Any = None
+        if settings.time_column is not None:
+            index = list(settings.columns).index(settings.time_column)
+            times = np.rint(values[:, index] * UNITS[settings.time_unit])
+            good = np.abs(times) < MOST_NS  # which NaN is not
+            self.malformed += int((~good).sum())
+            times, values = times[good].astype(np.int64), values[good]
         by_name = dict(zip(settings.columns, values.T, strict=True))
         host = np.full(len(values), host_ns)
-        t_ns = host
-        if settings.time_column is not None:
-            t_ns = np.rint(by_name[settings.time_column] * UNITS[settings.time_unit])
-            t_ns = t_ns.astype(np.int64)
+        t_ns = host if times is None else times
         part = {"t": t_ns, "host": host, **{name: by_name[name] for name in settings.stored}}
         self.received += len(values)
-        self._buffer.add("rows", part, t_ns, values.nbytes)
+        # where a shared clock falls back, its fit says so
+        order = t_ns if settings.shared_clock is None else host
+        self._buffer.add("rows", part, order, values.nbytes)
 
     def _parse(self, data: bytes) -> tuple[list[Any], bytes]:
         """Return the whole rows in some bytes, and what is left of them."""

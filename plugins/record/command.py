@@ -62,6 +62,10 @@ def record(
         str | None,
         typer.Option("--tap", help="Two sensors that feel the same taps: imu,grip; key t marks."),
     ] = None,
+    pulses: Annotated[
+        str | None,
+        typer.Option("--pulses", help="Streams that see the same pulses: daq,box (docs: record)."),
+    ] = None,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Mark the trials as simulated.")
     ] = False,
@@ -88,6 +92,7 @@ def record(
             simulated=simulated,
             analysis=analysis,
             tap=None if tap is None else _two(tap),
+            pulses=None if pulses is None else tuple(pulses.split(",")),
             collects=True,
         ) as recorder,
         pressed_keys() as key,

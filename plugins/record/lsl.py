@@ -21,13 +21,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from sliplab.plugins.record.table import CLOCK, chunk_type, rows, table_kind
+from sliplab.plugins.record.table import rows, table_kind
 from sliplab.protocols.later import need
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.device_settings import DriverSettings
 from sliplab.rigs.core.driver import SensorDriver, lazy
 from sliplab.rigs.core.host_clock import StallTimer
-from sliplab.storage.streams import I64, Chunk, Column, Json, StreamKind
+from sliplab.storage.streams import CLOCK, I64, Chunk, Column, Json, StreamKind, chunk_type
 
 DEVICE = "LSL stream"
 DRIFT_PPM = 400.0

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.plugins.record.table import rows, table_kind
+from sliplab.plugins.record.table import MOST_NS, PULSES, rows, table_kind
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import (
     EVENTS_KIND,
@@ -26,6 +26,9 @@ MOST_BYTES = 256 * 10**6
 """Pushed data that wait to be written; more are lost, and counted."""
 READ_BYTES = 16 * 10**6
 """Data that are read at once, so that a program that pushes too fast costs no more memory."""
+LATE_NS = 500_000_000
+"""Rows that are older than newer ones by less are of a slow thread; by more, the clock fell back.
+"""
 _DAY_NS = 86_400 * 10**9
 
 
@@ -52,8 +55,9 @@ class PushedStream:
         self.unit = ""
         self.kind = None
         if columns is not None:
-            self.kind = SCALAR if len(columns) == 1 else table_kind(columns)
-            self.unit = next(iter(columns.values())) if len(columns) == 1 else ""
+            one = len(columns) == 1 and not columns.keys() & set(PULSES)
+            self.kind = SCALAR if one else table_kind(columns)
+            self.unit = next(iter(columns.values())) if one else ""
         self._lock = threading.Lock()
         self._running = False
         self._reset()
@@ -124,7 +128,10 @@ class PushedStream:
             self._bytes += size
 
     def read(self) -> Chunk:
-        """Return rows since the last call, in order of time; late ones are left out."""
+        """Return rows since the last call, in order of time; late ones are left out.
+
+        Numbers of a clock that fell back stay as they were pushed: its fit refuses them.
+        """
         parts: list[Chunk] = []
         size = 0
         with self._lock:
@@ -134,6 +141,11 @@ class PushedStream:
             self._bytes -= size
         chunk = type(parts[0]).concatenate(parts) if parts else self.empty()
         if not len(chunk):
+            return chunk
+        last = int(chunk.times[0]) if self._last is None else self._last
+        newest = np.maximum.accumulate(np.maximum(chunk.times, last))
+        if self.kind is not None and int((newest - chunk.times).max()) >= LATE_NS:
+            self._last = int(chunk.times[-1])
             return chunk
         if np.any(chunk.times[1:] < chunk.times[:-1]):
             chunk = chunk[np.argsort(chunk.times, kind="stable")]
@@ -161,6 +173,12 @@ class PushedStream:
         times = np.atleast_1d(np.asarray(now // per_unit if t is None else t))
         if times.dtype.kind not in "iu" or times.ndim != 1:
             raise InputError(self._name, "t", t, "must be whole numbers: ns, or us of events")
+        if any(
+            abs(int(each)) * per_unit >= MOST_NS
+            for each in (times.min(initial=0), times.max(initial=0))
+        ):
+            text = "must lie within 146 years of its clock's zero"
+            raise InputError(self._name, "t", int(times[np.argmax(np.abs(times))]), text)
         times = times.astype(np.int64)
         if self._host_clock and len(times) and abs(int(times[-1]) * per_unit - now) > _DAY_NS:
             text = 'is not of time.monotonic_ns(); declare the stream with clock="own"'

@@ -26,7 +26,7 @@ from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
 from sliplab.plugins.record.sources import Source, opened
-from sliplab.plugins.record.tapped import check_tap
+from sliplab.plugins.record.tapped import check_common
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
@@ -68,6 +68,8 @@ class Recorder:
             adapter (docs/adapters.md).
         tap: names of two sensors that feel the same taps: the clock of the first is then known by
             the second, near marks named ``tap`` or anywhere in a trial.
+        pulses: names of two sensors that see the same pulses, and of others that share the clock of
+            the first, which is then known by the second (`plugins.record.pulsed`).
         collects: `sliplab stop` ends this program.
 
     Raises:
@@ -86,9 +88,10 @@ class Recorder:
         simulated: bool = False,
         analysis: str | Path | None = None,
         tap: tuple[str, str] | None = None,
+        pulses: tuple[str, ...] | None = None,
         collects: bool = False,
     ) -> None:
-        self._tap = tap
+        self._tap, self._pulses = tap, pulses
         self._streams = [streams] if isinstance(streams, (str, Path, Source)) else list(streams)
         self._store, self._name = Path(store), safe_name(campaign)
         self._operator, self._simulated = operator, simulated
@@ -104,8 +107,9 @@ class Recorder:
     def __enter__(self) -> Self:
         with ExitStack() as undo, ExitStack() as devices:
             self.sources = opened(self._streams, devices)  # wrong input writes nothing
-            if self._tap is not None:
-                check_tap(self._tap, self.sources)
+            for key, names in (("tap", self._tap), ("pulses", self._pulses)):
+                if names is not None:
+                    check_common(key, names, self.sources)
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
@@ -320,6 +324,7 @@ class RecordedTrial:
             operator=recorder._operator,
             sources={source.name: source.about for source in recorder.sources},
             tap=recorder._tap,
+            pulses=recorder._pulses,
         )
         try:
             self._stream(writer, begun)

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
-from sliplab.plugins.record.table import CLOCK, chunk_type, rows
+from sliplab.plugins.record.table import rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.timing import WIRED, StreamGrade, StreamTiming
@@ -34,6 +34,7 @@ from sliplab.rigs.stream_settings import (
 )
 from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import (
+    CLOCK,
     EVENTS_KIND,
     FRAMES_KIND,
     SCALAR,
@@ -46,6 +47,7 @@ from sliplab.storage.streams import (
     ScalarChunk,
     Sink,
     WrenchChunk,
+    chunk_type,
 )
 
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import make_dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.streams import READS, SCALAR, Chunk, Column, ScalarChunk, StreamKind
+from sliplab.storage.streams import SCALAR, Chunk, Column, ScalarChunk, StreamKind, chunk_type
 
 _COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
-_ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
-CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
-"""Readings of a stream's clock: its time, and between which two times of the host that was."""
+PULSES = ("state", "harp", "id")
+"""Columns of a stream that sees pulses: a line's levels, a Harp clock's levels, or barcodes."""
+MOST_NS = 2**62
+"""Times beyond are none: the difference of two would not fit into int64."""
 
 
 def table_kind(columns: Mapping[str, str]) -> StreamKind:
@@ -35,21 +34,6 @@ def table_kind(columns: Mapping[str, str]) -> StreamKind:
             raise InputError("columns", "", name, text)
     values = {name: Column(name, "float64", (), unit) for name, unit in columns.items()}
     return StreamKind("table", {name: SCALAR.columns[name] for name in TIMES} | values)
-
-
-def chunk_type(kind: StreamKind) -> type[Chunk]:
-    """Return the type of a kind's chunks, with an array for each column."""
-    return _chunk_type(kind.name, tuple(kind.columns.items()))
-
-
-@cache
-def _chunk_type(name: str, columns: tuple[tuple[str, Column], ...]) -> type[Chunk]:
-    kind = StreamKind(name, dict(columns))
-    fields = [(column.field, np.ndarray) for _, column in columns]
-    made: Any = make_dataclass(
-        "TableChunk", fields, bases=(Chunk,), namespace={"KIND": kind}, frozen=True
-    )
-    return made
 
 
 def rows(kind: StreamKind, unit: str, arrays: Mapping[str, Any]) -> Chunk:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.timing import StreamTiming
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.schema.trial import DeviceRecord
+from sliplab.storage.streams import I64
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 
 if TYPE_CHECKING:
@@ -26,18 +27,22 @@ NEAR_NS = 1_000_000_000
 """Time on either side of such a mark in which taps are looked for."""
 
 
-def check_tap(tap: tuple[str, str], sources: Iterable[Source]) -> None:
-    """Raise InputError unless the first of two sensors has a clock of its own."""
+def check_common(key: str, names: tuple[str, ...], sources: Iterable[Source]) -> None:
+    """Raise InputError unless all of two or more sensors but the second have their own clock.
+
+    Args:
+        key: ``tap`` or ``pulses``, which they have in common.
+    """
     known = {source.name: source for source in sources if not source.stream.about.of_camera}
-    for name in tap:
-        if name not in known or tap[0] == tap[1]:
-            text = f"must be two sensors of {', '.join(known) or 'which there are none'}"
-            raise InputError("tap", "", ", ".join(tap), text)
-    timing = known[tap[0]].stream.about.timing or StreamTiming()
-    own = known[tap[0]].clock == TIMING and timing.grade == "host time"
-    if not own and known[tap[0]].clock != READS:
-        text = "has no clock of its own that taps could align; name it second"
-        raise InputError("tap", "", tap[0], text)
+    if not known.keys() >= set(names) or len(set(names)) < max(2, len(names)):
+        text = f"must be different sensors of {', '.join(known) or 'which there are none'}"
+        raise InputError(key, "", ", ".join(names), text)
+    for name in (names[0], *names[2:]):
+        timing = known[name].stream.about.timing or StreamTiming()
+        own = known[name].clock == TIMING and timing.grade == "host time"
+        if not own and known[name].clock != READS:
+            text = f"has no clock of its own that {key} could align; name it second"
+            raise InputError(key, "", name, text)
 
 
 def clock_by_taps(
@@ -57,28 +62,51 @@ def clock_by_taps(
         NoMatchError: there is no clear tap, or it contradicts what is known by other means.
     """
     first, second = known[tap[0]], known[tap[1]]
+    error = known_error_ns(tap[1], second)
     own_ns, own = _taps(reader, tap[0], marks_ns)
     _, other = _taps(reader, tap[1], marks_ns)
-    error = round(second.uncertainty_ns or 0)
     there = (second.map.to_reference(each) for each in (other.low_ns, other.high_ns))
     low, high = there
     timing = about.record.timing or StreamTiming()
     found = map_by_taps(own, Taps(low - error, high + error), timing.drift_ppm + HOST_PPM)
     ends = np.array([own_ns[0], own_ns[-1]])
-    least, most = found.bounds(ends)
+    said = {"grade": TAP, "kind": "hard bound", "pairs": found.taps}
+    return closer(first, ends, *found.bounds(ends), said)
+
+
+def known_error_ns(name: str, clock: DeviceRecord) -> int:
+    """Return the bound of a clock's error, ns. Raises ValueError if there is none."""
+    if clock.uncertainty_ns is None:
+        raise ValueError(f"how far the times of {name} may be off is not stated (uncertainty_ms)")
+    return round(clock.uncertainty_ns)
+
+
+def closer(
+    first: DeviceRecord | None, at: I64, least: I64, most: I64, about: Mapping[str, Any]
+) -> DeviceRecord:
+    """Return the clock by common events, or the one known by other means if that is closer.
+
+    Args:
+        first: the clock by other means, if it is known.
+        at, least, most: (n,) times of the clock, and between which times on the host's they lie.
+        about: what the record says of the clock by common events.
+
+    Raises:
+        NoMatchError: they contradict each other.
+    """
     middle, half = least + (most - least) // 2, float((most - least).max()) / 2 + 1
-    off = np.abs(middle - first.map.to_reference(ends)).max()
-    if off > half + (first.uncertainty_ns or 0):
-        raise NoMatchError(
-            "no_match",
-            f"by taps it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
-        )
-    if half >= (first.uncertainty_ns or np.inf):
-        return first
-    line: Any = ClockMap.through(ends.tolist(), middle.tolist())
-    return DeviceRecord(
-        grade=TAP, kind="hard bound", map=line, uncertainty_ns=half, pairs=found.taps
-    )
+    if first is not None:
+        known = first.uncertainty_ns or 0
+        off = np.abs(middle - first.map.to_reference(at)).max()
+        if off > half + known:
+            raise NoMatchError(
+                "no_match",
+                f"it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
+            )
+        if half >= (first.uncertainty_ns or np.inf):
+            return first
+    line: Any = ClockMap.through(at.tolist(), middle.tolist())
+    return DeviceRecord(map=line, uncertainty_ns=half, **about)
 
 
 def _taps(reader: StreamReader, name: str, marks_ns: Iterable[int]) -> tuple[Any, Taps]:

@@ -38,7 +38,7 @@ class BegunTrial(BaseModel):
 
     Attributes:
         begin_ns: on the host's clock. started: UTC, ISO 8601.
-        tap: two sensors that felt the same taps.
+        tap: two sensors that felt the same taps. pulses: see `plugins.record.pulsed`.
     """
 
     trial: str
@@ -53,6 +53,7 @@ class BegunTrial(BaseModel):
     sources: dict[str, SourceAbout]
     marks: list[Mark] = Field(default_factory=list)
     tap: tuple[str, str] | None = None
+    pulses: tuple[str, ...] | None = None
 
 
 def make_record(
@@ -77,7 +78,7 @@ def make_record(
     counted = {name: rows for name, (rows, _) in streams.items()}
     present = {name: each for name, each in begun.sources.items() if counted.get(name)}
     tapped = [mark.t_ns for mark in begun.marks if mark.name == TAP]
-    clocks = fit_clocks(folder, present, span, begun.tap, tapped)
+    clocks = fit_clocks(folder, present, span, begun.tap, tapped, begun.pulses)
     gates = {
         f"clock_{name}": Gate(passed=False, value=why)
         for name, why in clocks.refused.items()
@@ -87,9 +88,7 @@ def make_record(
     inside = [mark for mark in marks if span[0] <= mark.t_ns <= span[1]]
     notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
     notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
-    notes += (
-        [f"the clock of {begun.tap[0]} by taps: {clocks.tap}"] if clocks.tap and begun.tap else []
-    )
+    notes += clocks.common
     notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
     about: dict[str, Any] = {
         "format": FORMAT,

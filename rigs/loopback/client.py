@@ -22,6 +22,7 @@ from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import PlateCourse, RigError, Truth
 from sliplab.rigs.core.driver import EventCameraDriver
+from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 from sliplab.rigs.core.library_process import PipeCalls
 from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.loopback import STREAMS
@@ -29,12 +30,13 @@ from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import EventStream, Stream
-from sliplab.storage.process import leave_to_parent, out_of_reach
+from sliplab.storage.process import leave_to_parent, out_of_reach, used_s
 from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.streams import FrameChunk, Sink
 
 READY_S = 180.0
-"""Timeout for the fakes to start: kernels may have to be compiled, s."""
+"""Timeout for the fakes to start, in which kernels may be compiled: s of their own processor time,
+or without any, since a busy computer delays them at will."""
 ANSWER_S = 20.0
 """Timeout of an answer, s."""
 TURN_S = 0.004
@@ -82,7 +84,7 @@ class Loopback:
         their_frames.close()
         self._calls = PipeCalls(ours, self._process.kill, pending=1)
         try:
-            self.addresses: Mapping[str, Any] = self._result(lambda: self._calls.answer(READY_S))
+            self.addresses: Mapping[str, Any] = self._result(self._ready)
         except BaseException:
             self.close()
             raise
@@ -212,6 +214,15 @@ class Loopback:
         if not good:
             raise RigError(*value)
         return value
+
+    def _ready(self) -> tuple[bool, Any]:
+        """Return the answer that the fakes send once they have started."""
+        idle, pid = StallTimer(), self._process.pid or 0
+        while not self._calls.pipe.poll(STEP_S):
+            used = used_s(pid)
+            if used > READY_S or idle.waited_s(used) > READY_S:
+                raise TimeoutError(f"did not start in {READY_S:g} s of processor time")
+        return self._calls.answer(ANSWER_S)
 
     def _read_frames(self) -> None:
         with suppress(EOFError, OSError):

@@ -265,6 +265,15 @@ class RowFile:
         """Return the unit of a named stream; ``""`` where it says none."""
         return _text(self._group(f"{STREAM_GROUP}/{name}"), UNIT_ATTRIBUTE)
 
+    def column_unit(self, name: str, part: str) -> str:
+        """Return the unit of a column of a named stream; ``""`` where it says none."""
+        kind = self.kind(group := f"{STREAM_GROUP}/{name}")
+        if kind == SCALAR.name and part == "value":
+            return self.unit(name)
+        if kind in STREAMS:
+            return STREAMS[kind].columns[part].unit
+        return _text(self._group(group), f"{UNIT_ATTRIBUTE}_{part}")
+
     def has(self, name: str) -> bool:
         """Return whether there is a column of this name, or something that cannot be read."""
         if name in self._opened:
@@ -776,6 +785,10 @@ class StreamReader:
         parts = self.parts(name)
         rows = self._group(f"{STREAM_GROUP}/{name}", *parts)
         return {part: column.read() for part, column in zip(parts, rows, strict=True)}
+
+    def column_unit(self, name: str, part: str) -> str:
+        """Return the unit of a column of a named stream; ``""`` where it says none."""
+        return self._file.column_unit(name, part)
 
     def column(self, name: str) -> Array:
         """Return a column by its name in the file, such as ``frames/t``; times are int64."""

@@ -331,8 +331,11 @@ class StreamFile:
         if path.startswith(STREAM_GROUP):
             about = self._file[path].attrs
             about[KIND_ATTRIBUTE] = np.bytes_(chunk.KIND.name)
-            if unit := getattr(chunk, "unit", ""):
-                about[UNIT_ATTRIBUTE] = np.bytes_(unit.encode())
+            units = {UNIT_ATTRIBUTE: getattr(chunk, "unit", "")}
+            if chunk.KIND.name not in STREAMS:
+                columns = chunk.KIND.columns.items()
+                units |= {f"{UNIT_ATTRIBUTE}_{part}": column.unit for part, column in columns}
+            about.update({key: np.bytes_(unit.encode()) for key, unit in units.items() if unit})
 
     def _indexed(self, chunk: EventChunk) -> EventChunk:
         """Return events with times after the offset, once they are in the index.

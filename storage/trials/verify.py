@@ -21,7 +21,7 @@ from sliplab.storage.files import is_temporary, read_json, temporary_files
 from sliplab.storage.process import named
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.streams import EVENTS_KIND
+from sliplab.storage.streams import CLOCK, EVENTS_KIND
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,
@@ -403,7 +403,9 @@ def _stream_problems(folder: Path, reader: StreamReader, record: TrialRecord) ->
             for part, count in counts[name].items()
             if count != given.rows
         ]
-        if runs_backwards(reader, f"{path}/t"):
+        # readings of a clock, and rows without a map, have the times that the device gave
+        as_given = given.kind == CLOCK.name or name in record.clocks.refused
+        if not as_given and runs_backwards(reader, f"{path}/t"):
             problems.append((folder / DATA, f"{path}/t runs backwards"))
     return problems
 

@@ -23,7 +23,7 @@ _TOPICS = (
     ("/phases", ros2.PHASE, "phases of the motion"),
     ("/onsets", ros2.ONSET, "onsets of the label, by each rule"),
     (
-        "/NAME",
+        "/NAME, /NAME/COLUMN",
         f"{ros2.WRENCH}, {ros2.SCALAR}, {ros2.EVENTS} or {ros2.IMAGE}",
         "further sensors and cameras: N and N m along the sensor's axes, readings in their unit",
     ),

@@ -362,9 +362,9 @@ def _ours(path: Path, found: _Found) -> ForeignTrial:
         events,
         frames,
         {
-            key[1].split("/")[1]: parts[0].unit
+            key[1]: parts[0].unit
             for key, parts in found.columns.items()
-            if key[1].startswith("streams/") and key[1].endswith("/value")
+            if key[1].startswith("streams/")
         },
         rate_hz,
         label,

@@ -19,9 +19,15 @@ import numpy as np
 
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.storage.files import inside, json_text
-from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.schema.label import KINDS, LABELS, RULES, RuleOnsets, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, EventChunk, Json
+from sliplab.storage.streams import (
+    CLOCK,
+    EVENTS_KIND,
+    FRAMES_KIND,
+    I64,
+    EventChunk,
+    Json,
+)
 from sliplab.storage.trials.checksums import DATA, PROVENANCE, RECORD, stream_file
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.hdf5_reader import StreamReader
@@ -73,11 +79,6 @@ def write_mcap(
     """
     from mcap.writer import Writer
 
-    for name, stream in recording.record.streams.items():
-        if not stream.of_camera and stream.kind not in STREAMS:
-            raise FormatError(
-                f"has the stream '{name}' of kind '{stream.kind}', which MCAP does not take"
-            )
     with path.open("xb") as handle:
         writer = Writer(handle)
         writer.start(profile="ros2", library=LIBRARY)
@@ -179,6 +180,9 @@ class _Trial:
             yield self._wrenches(name)
         for name in recording.streams("scalar"):
             yield self._scalars(name)
+        for name, kind in recording.record.streams.items():
+            if not kind.of_camera and kind.kind not in {*STREAMS, CLOCK.name} and kind.rows:
+                yield self._table(name)
         for group, device in _PULSES.items():
             yield self._pulses(group, device)
         yield self._phases()
@@ -273,6 +277,18 @@ class _Trial:
         for t_ns, value in zip(times, found.value.tolist(), strict=True):
             yield t_ns, channel, ros2.scalar(t_ns, name, value, found.unit)
 
+    def _table(self, name: str) -> Iterator[Message]:
+        with self.recording.open() as reader:
+            columns = reader.stream(name)
+            units = {part: reader.column_unit(name, part) for part in columns}
+        times = self._line(name, columns["t"]).tolist()
+        shown = [part for part, values in columns.items() if values.dtype == np.float64]
+        channels = [self._channel(f"/{name}/{part}", ros2.SCALAR) for part in shown]
+        for row, t_ns in enumerate(times):
+            for channel, part in zip(channels, shown, strict=True):
+                value = float(columns[part][row])
+                yield t_ns, channel, ros2.scalar(t_ns, name, value, units[part])
+
     def _pulses(self, group: str, device: str) -> Iterator[Message]:
         with self.recording.open() as reader:
             seen = reader.pulses(group)
@@ -333,10 +349,9 @@ def _column_units(reader: StreamReader) -> dict[str, str]:
         for name, column in known.items()
         if counts[name] and not name.startswith("events/")
     }
-    for name, kind in reader.streams().items():
-        unit = reader.scalars(name).unit if kind == "scalar" else ""
-        for part, column in STREAMS[kind].columns.items() if kind in STREAMS else ():
-            found[f"{STREAM_GROUP}/{name}/{part}"] = unit if part == "value" else column.unit
+    for name in reader.streams():
+        for part in reader.parts(name):
+            found[f"{STREAM_GROUP}/{name}/{part}"] = reader.column_unit(name, part)
     return found
 
 

@@ -29,9 +29,13 @@ from sliplab.storage.streams import (
     SCALAR,
     U8,
     Chunk,
+    Column,
     EventChunk,
     FrameChunk,
     Json,
+    ScalarChunk,
+    StreamKind,
+    chunk_type,
 )
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.derived import Derived
@@ -41,6 +45,7 @@ from sliplab.storage.trials.hdf5_writer import (
     LATE_GROUPS,
     OWN_DEVICES,
     STREAM_GROUP,
+    STREAM_NAME,
     STREAMS,
     TIMING,
     TRACKS,
@@ -62,7 +67,7 @@ class Original:
         columns: all but those of events, by file and name.
         events: events of each camera by the name of its stream, in order of time.
         frames: frames of each camera that has a video.
-        units: units of scalar streams, by name.
+        units: units of the columns of named streams.
         label: label document and its arrays (an ``.npz`` file), where it has some.
         sync: result of fitting its clocks again, where that is in use.
     """
@@ -91,6 +96,10 @@ class Original:
             if stated.kind in STREAMS:
                 for part, column in STREAMS[stated.kind].columns.items():
                     known[f"{STREAM_GROUP}/{stream}/{part}"] = column
+            elif not stated.of_camera and name.startswith(f"{STREAM_GROUP}/{stream}/"):
+                part, dtype = name.rpartition("/")[2], values.dtype.name
+                if STREAM_NAME.fullmatch(part) and dtype in {"int64", "float64"}:
+                    known[name] = Column(part, dtype, (), "")
         files = {DATA, *(stream_file(name) for name, stated in streams.items() if stated.of_camera)}
         if name not in known or name.startswith("events/") or file not in files:
             raise FormatError(f"holds the column {name!r:.60} of {file!r:.60}, which no trial has")
@@ -149,8 +158,20 @@ class Original:
             if stated.of_camera:
                 self._fill_file(writer, stream_file(name), {stated.kind: name})
             elif f"{group}/t" in data:
-                unit = {"unit": self.units.get(name, "")} if stated.kind == SCALAR.name else {}
-                writer.add(name, _chunk(data, group, stated.kind, **unit))
+                writer.add(name, self._rows(data, group, stated.kind))
+
+    def _rows(self, data: Mapping[str, Array], group: str, name: str) -> Chunk:
+        """Return the rows of a named stream."""
+        if name == SCALAR.name:
+            return _chunk(data, group, ScalarChunk, unit=self.units.get(f"{group}/value", ""))
+        if name in STREAMS:
+            return _chunk(data, group, CHUNKS[name])
+        parts = {key.rpartition("/")[2]: key for key in data if key.startswith(f"{group}/")}
+        columns = {
+            part: Column(part, data[key].dtype.name, (), self.units.get(key, ""))
+            for part, key in parts.items()
+        }
+        return _chunk(data, group, chunk_type(StreamKind(name, columns)))
 
     def _of(self, file: str) -> dict[str, Array]:
         return {name: values for (of, name), values in self.columns.items() if of == file}
@@ -173,7 +194,7 @@ class Original:
             elif group == FRAMES_KIND:
                 chunks = self._frames(name, data)
             elif f"{group}/t" in data:
-                chunks = [_chunk(data, group, kind.name)]
+                chunks = [_chunk(data, group, CHUNKS[kind.name])]
             for chunk in chunks:
                 writer.add(name, chunk)
 
@@ -227,9 +248,8 @@ class Original:
         write_json(campaign.sync_file(recording.folder.name), saved.to_json())
 
 
-def _chunk(data: Mapping[str, Array], group: str, kind: str, **more: str) -> Chunk:
+def _chunk(data: Mapping[str, Array], group: str, chunk: type[Chunk], **more: str) -> Chunk:
     """Return the rows of a group. Raises FormatError as `_group`."""
-    chunk = CHUNKS[kind]
     parts = tuple(chunk.KIND.columns)
     found = dict(zip(parts, _group(data, group, parts), strict=True))
     return chunk.from_columns(found, **more)

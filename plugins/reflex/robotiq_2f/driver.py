@@ -70,10 +70,11 @@ class Robotiq2f:
             RigError: a fault, or no answer.
         """
         self._check_fault()
+        asked = self._asked
+        # whether the move was taken up is read first: what OBJ says before is of the one before
+        waits = asked is not None and self._get("PRE") != asked
         counts, at = self._get("POS"), self._get("OBJ")
-        moving = False
-        if self._asked is not None:
-            moving = at == protocol.MOVING or self._get("PRE") != self._asked
+        moving = asked is not None and (waits or at == protocol.MOVING)
         stalled = not moving and at in (protocol.OPENING_ON, protocol.CLOSING_ON)
         return GripperState(protocol.opening_mm(counts, self.range), moving, stalled)
 

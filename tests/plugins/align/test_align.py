@@ -315,6 +315,17 @@ def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) 
     assert text in done.stderr
 
 
+def test_taps_of_a_harp_clock_and_times_that_fall_back_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,pull\n1.5,0\n1.25,1\n")
+    for b, text in (
+        ("harp", "B.csv = harp: must be a file with a signal"),
+        (tmp_path / "a.csv", "sample 2 = 1.25 s: falls back behind the one before"),
+    ):
+        done = here("align", tmp_path / "a.csv", b, "--taps")
+        assert done.returncode == 2
+        assert text in " ".join(done.stderr.split())
+
+
 def test_times_beyond_the_events_are_counted_and_an_older_file_is_kept(tmp_path: Path) -> None:
     taps = np.cumsum(np.random.default_rng(RNG).uniform(0.5, 1.5, 40))
     _write(tmp_path / "a.csv", "t", taps)

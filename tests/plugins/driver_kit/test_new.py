@@ -90,7 +90,7 @@ def test_several_kinds_are_drivers_of_one_package() -> None:
 def test_a_kind_given_twice_is_refused(tmp_path: Path) -> None:
     done = here("new", "driver", "lab", "--kind", "arm,arm", "--into", tmp_path)
     assert done.returncode == 2
-    assert "each once" in done.stderr
+    assert "must name" in done.stderr
 
 
 @pytest.mark.parametrize(

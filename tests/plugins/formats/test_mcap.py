@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import struct
+import threading
+import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,10 +21,14 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from scipy.spatial.transform import Rotation
 
+from sliplab.flows.api import open_store
 from sliplab.plugins.formats.ros import messages as ros2
 from sliplab.plugins.formats.ros.mcap_writer import write_mcap
 from sliplab.plugins.publish.forms import publish
 from sliplab.plugins.publish.imported import of_one_campaign
+from sliplab.plugins.record.recorder import RecordedTrial
+from sliplab.plugins.record.recorder import record as sliplab_record
+from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.formats.export_trials import label_table
@@ -335,6 +341,45 @@ def test_an_imported_campaign_and_one_without_frames_come_back(tmp_path: Path) -
     (tmp_path / "out" / "campaigns" / "d").mkdir()
     with pytest.raises(InputError, match=r"must be of one campaign; name one of these folders: "):
         of_one_campaign(tmp_path / "out")
+
+
+def test_a_recorded_campaign_comes_back_with_its_tables(tmp_path: Path) -> None:
+    streams = [
+        push("pull", {"fx": "N", "fy": "N"}, clock="utc", uncertainty_ms=1000),
+        push("wrong", {"warm": "degC"}, clock="ptp", uncertainty_ms=1),
+        push("events", events_px=(64, 48)),
+    ]
+    with sliplab_record(streams, tmp_path / "store", "c") as recording, recording.trial() as trial:
+        for k in range(5):
+            trial.push("pull", time.time_ns(), k, -k)
+            trial.push("wrong", 10**12 - k * 10**10, k)
+            trial.push("events", None, 1, 2, 1)
+            waited_for(trial, "pull", k + 1)
+    ours = Store.open(tmp_path / "store")
+    (found,) = ours.campaign("c").recordings()
+    assert "wrong" in found.clocks.refused
+    arrays = open_store(tmp_path / "store").trial(trial.id).to_dict()
+    assert arrays["data_vars"]["pull_fy"]["data"].tolist() == [0, -1, -2, -3, -4]
+    assert "wrong_t_ns" not in arrays["coords"]
+    publish(publication(ours), tmp_path / "out", "mcap")
+    (file,) = (tmp_path / "out").rglob("*.mcap")
+    with file.open("rb") as handle:
+        topics = {channel.topic for _, channel, _ in make_reader(handle).iter_messages()}
+    assert {"/pull/fx", "/pull/fy", "/wrong", "/events"} < topics
+    theirs = Store.create(tmp_path / "again")
+    take(theirs, tmp_path / "out", "c")
+    assert_equal(ours, theirs)
+    (again,) = theirs.campaign("c").recordings()
+    with again.open() as reader:
+        assert reader.column_unit("pull", "fx") == "N"
+
+
+def waited_for(trial: RecordedTrial, name: str, rows: int) -> None:
+    """Wait until a trial has rows of a stream."""
+    end = time.monotonic() + 30
+    while trial.rows()[name] < rows:
+        assert time.monotonic() < end
+        threading.Event().wait(0.002)
 
 
 def test_trials_of_two_campaigns_are_not_mixed(

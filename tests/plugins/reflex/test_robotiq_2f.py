@@ -73,6 +73,22 @@ def test_a_move_is_moving_before_the_gripper_has_taken_it_up(bench: Bench) -> No
     assert bench.fake.sets == ["SET POS 150 SPE 255 FOR 0 GTO 1"]
 
 
+@pytest.mark.parametrize("step_ms", [0.3, 0.7, 0.9, 1.1, 2.1])
+def test_a_move_taken_up_between_two_questions_is_moving(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, step_ms: float
+) -> None:
+    answer = bench.fake.answer
+
+    def slowly(line: str) -> bytes:
+        found = answer(line)
+        bench.now_ns += round(step_ms * MS) * line.startswith("GET")
+        return found
+
+    monkeypatch.setattr(bench.fake, "answer", slowly)
+    bench.gripper.move(35.0, 150.0, 20.0)
+    assert bench.gripper.state().moving
+
+
 def test_a_stop_ends_a_move_where_the_fingers_are(bench: Bench) -> None:
     bench.gripper.move(0.0, 20.0, 20.0)
     bench.wait(200)

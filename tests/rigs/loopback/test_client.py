@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -45,6 +47,17 @@ def test_answer_that_comes_late_is_not_taken_for_the_next_one(
     late.set()
     with pytest.raises(RigError, match="fakes: their process has ended"):
         loopback.at_rest()
+
+
+@pytest.mark.parametrize(("pid", "limit_s"), [(0, 0.3), (os.getpid(), 1e-3)])
+def test_fakes_that_idle_or_work_for_too_long_do_not_start(
+    monkeypatch: pytest.MonkeyPatch, pid: int, limit_s: float
+) -> None:
+    monkeypatch.setattr(client, "READY_S", limit_s)
+    loopback = fakes(lambda pipe: None)
+    monkeypatch.setattr(loopback, "_process", SimpleNamespace(pid=pid), raising=False)
+    with pytest.raises(RigError, match="fakes: did not start"):
+        loopback._result(loopback._ready)
 
 
 def test_answer_after_ctrl_c_is_its_own_questions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,179 @@
+"""Stamps of wrong clocks: every row is stored as it was stamped, and no clock is believed."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplab.flows.verify import verify
+from sliplab.plugins.record.recorder import record
+from sliplab.plugins.record.sources import SHARED, columns, push
+from sliplab.protocols.errors import InputError
+from sliplab.storage.streams import I64
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+
+STEPS, STEP_S, STATED_MS = 40, 0.01, 2.0
+S = 1_000_000_000
+STAMPS: dict[str, Callable[[int, int, int], int]] = {
+    "right": lambda t, first, k: t,
+    "back_in_mid_trial": lambda t, first, k: t - 5 * S * (k > STEPS // 2),
+    "leap_second": lambda t, first, k: t - S * (k > STEPS // 2),
+    "ahead_in_mid_trial": lambda t, first, k: t + 5 * S * (k > STEPS // 2),
+    "one_ahead": lambda t, first, k: t + 5 * S * (k == STEPS // 2),
+    "one_behind": lambda t, first, k: t - 5 * S * (k == STEPS // 2),
+    "falling": lambda t, first, k: 2 * first - t - k * S,
+    "constant": lambda t, first, k: first,
+    "tai_for_utc": lambda t, first, k: t + 37 * S,
+    "utc_for_tai": lambda t, first, k: t - 37 * S,
+    "smeared": lambda t, first, k: t + S // 2 + (t - first) * 116 // 10**7,
+    "another_epoch": lambda t, first, k: t - 3_000_000 * S,
+    "from_zero": lambda t, first, k: t - first,
+    "seconds_for_ns": lambda t, first, k: t // S,
+    "us_for_ns": lambda t, first, k: t // 1000,
+    "far_future": lambda t, first, k: 2**62 - 1 - S + k,
+    "far_past": lambda t, first, k: 1 - 2**62 + k,
+}
+"""What a source may stamp at a time, from that, its first and the number of its step."""
+BELIEVED = {
+    # what is only another zero, or another rate below the allowed drift
+    "own": {
+        *("right", "tai_for_utc", "utc_for_tai", "smeared", "another_epoch", "from_zero"),
+    },
+    "ptp": {"right"},
+    "utc": {"right"},
+    # rows may be pushed long after they were measured
+    "host": {"right", "constant"},
+}
+AT_ONCE = {
+    "host": {"another_epoch", "far_future", "far_past"},
+}
+"""Stamps more than a day from the host's clock are errors of `push`."""
+
+
+def pushed(trial_push: Callable[..., None], clock: str) -> dict[str, list[int]]:
+    """Push the rows of all streams in real time; return the stamps that were taken, by stream."""
+    taken: dict[str, list[int]] = {name: [] for name in STAMPS}
+    first = time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC))
+    for k in range(STEPS):
+        threading.Event().wait(STEP_S)  # the sensor's period
+        for name, stamp in STAMPS.items():
+            t_ns = stamp(time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC)), first, k)
+            try:
+                trial_push(name, t_ns, float(k))
+            except InputError:
+                assert name in AT_ONCE[clock]
+            else:
+                taken[name].append(t_ns)
+    return taken
+
+
+def stored(recording: Recording, name: str) -> I64:
+    with recording.open() as reader:
+        column: I64 = reader.column(f"streams/{name}/t")
+    return column
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("clock", list(BELIEVED))
+def test_rows_keep_the_stamps_they_came_with_and_wrong_clocks_are_refused(
+    tmp_path: Path, clock: str
+) -> None:
+    stated = None if clock == "own" else STATED_MS
+    streams = [push(name, {"a": "N"}, clock=clock, uncertainty_ms=stated) for name in STAMPS]
+    with record(streams, tmp_path, "stamps") as recorder, recorder.trial() as trial:
+        taken = pushed(trial.push, clock)
+    assert verify(str(tmp_path))["ok"]
+    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    clocks, about = recording.clocks, recording.record.imported
+    there = {name for name, stamps in taken.items() if stamps}
+    for name in there:
+        np.testing.assert_array_equal(stored(recording, name), taken[name], err_msg=name)
+    assert set(STAMPS) - there == AT_ONCE.get(clock, set())
+    assert not about.dropped
+    assert {name for name in clocks.streams if not name.endswith("_clock")} == BELIEVED[clock]
+    assert set(clocks.refused) == there - BELIEVED[clock]
+    for name, why in clocks.refused.items():
+        assert f"the clock of {name} is not known: {why}" in about.warnings
+        assert "rig file" not in why
+        assert "nan" not in why
+
+
+@pytest.mark.parametrize("clock", list(BELIEVED))
+def test_what_is_no_time_is_not_taken(tmp_path: Path, clock: str) -> None:
+    stream = push("g", {"a": "N"}, clock=clock, uncertainty_ms=STATED_MS)
+    with record([stream], tmp_path, "stamps") as recorder, recorder.trial() as trial:
+        for wrong in (np.array([2**63], np.uint64), -(2**63), 2**62, 2**70, float("nan"), "1"):
+            with pytest.raises(InputError):
+                trial.push("g", wrong, 1.0)
+        trial.push("g", 5 if clock != "host" else None, 1.0)
+    assert verify(str(tmp_path))["ok"]
+
+
+TEXTS: dict[str, Callable[[int, int], str]] = {
+    "back": lambda t, k: f"{(t - 5 * S * (k > STEPS // 2)) / S:.9f}",
+    "tai": lambda t, k: f"{t / S + 37:.9f}",
+    "nan_once": lambda t, k: "nan" if k == STEPS // 2 else f"{t / S:.9f}",
+    "infinite_once": lambda t, k: "inf" if k == STEPS // 2 else f"{t / S:.9f}",
+    "ns_for_s": lambda t, k: f"{t}",
+    "constant": lambda t, k: "1764547200",
+}
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("wrong", list(TEXTS))
+def test_lines_with_wrong_stamps_of_a_shared_clock(tmp_path: Path, wrong: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    clock = {"time_column": "at", "time_unit": "s", "shared_clock": "utc", "uncertainty_ms": 5}
+    source = columns("g", f"udp://127.0.0.1:{port}", {"at": "s", "a": "N"}, **clock)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        record([source], tmp_path, "stamps") as recorder,
+        recorder.trial(),
+    ):
+        for k in range(STEPS):
+            threading.Event().wait(STEP_S)  # the sensor's period
+            line = f"{TEXTS[wrong](time.time_ns(), k)},{k}\n"
+            sender.sendto(line.encode(), ("127.0.0.1", port))
+    assert verify(str(tmp_path))["ok"]
+    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    counts = recording.record.devices["g"]["counts"]
+    malformed = {"nan_once": 1, "infinite_once": 1, "ns_for_s": STEPS}.get(wrong, 0)
+    assert counts == {"received": STEPS - malformed, "malformed": malformed}
+    assert recording.record.streams["g"].rows == STEPS - malformed
+    assert ("g" in recording.clocks.streams) == (wrong in {"nan_once", "infinite_once"})
+    if wrong in {"back", "tai", "constant"}:
+        assert recording.clocks.refused["g"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("wrong", ["back_in_mid_trial", "ahead_in_mid_trial", "tai_for_utc"])
+def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
+    tmp_path: Path, wrong: str
+) -> None:
+    """A file of events is in the order of time, so that what falls back cannot be stored."""
+    source = push("events", events_px=(64, 48), clock="ptp", uncertainty_ms=STATED_MS)
+    first = time.clock_gettime_ns(SHARED["ptp"])
+    with record([source], tmp_path, "stamps") as recorder, recorder.trial() as trial:
+        for k in range(STEPS):
+            threading.Event().wait(STEP_S)  # the camera's period
+            t_ns = STAMPS[wrong](time.clock_gettime_ns(SHARED["ptp"]), first, k)
+            trial.push("events", t_ns // 1000, 1, 2, 1)
+    assert verify(str(tmp_path))["ok"]
+    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    about = recording.record.imported
+    lost = sum((about.dropped or {}).values())
+    assert recording.record.counts.events + lost == STEPS
+    if wrong == "back_in_mid_trial":
+        assert lost == STEPS - STEPS // 2 - 1
+    else:
+        assert "events" in recording.clocks.refused
+        assert not recording.record.quality.passed
