@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detector import (
@@ -20,10 +21,18 @@ from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.storage.streams import EventChunk
 
 WARM_UP_US = 1_000_000
+ALL_SLIPPED = 0.97
+"""Share of the tips from which slip is gross: no tip of 30 sticks."""
+
+I8 = npt.NDArray[np.int8]
+F64 = npt.NDArray[np.float64]
 
 
 class AtLevel(StreamDetector):
     """A detector with its level. Evidence above it is gross slip by the detector's own class alone.
+
+    Where the detector knows the share of slipped tips, slip goes on after an alarm for as long as
+    tips slip, and is gross once all of them do. Before an alarm the share is 0.
 
     The detector is given events in order: those that are older than what it has been given are left
     out, and those at the newest moment wait, as others of that moment may follow.
@@ -51,6 +60,7 @@ class AtLevel(StreamDetector):
         self._from_us = self._settled_us = self._window_us = at_us
         self._held = EventChunk.empty()
         self._events = 0
+        self._slipping = False
         self._last_us: int | None = None
         try:
             self.detector.begin(*self._size)
@@ -82,15 +92,32 @@ class AtLevel(StreamDetector):
         except Exception as error:  # another package's code: whatever it raises
             raise _failure(error) from error
         found = checked(found, before_us - start_us, until_us - start_us)
-        slip = np.where(found.label == GROSS, GROSS, INCIPIENT)
-        label = np.where(found.value > self.level, slip, NO_SLIP).astype(np.int8)
+        label, slipped = self._classes(found)
         t_us = found.t_us + start_us
         windows = self._windows(given, t_us.tolist())
-        return Evidence(t_us, found.value, label, windows, found.slipped)
+        return Evidence(t_us, found.value, label, windows, slipped)
 
     def close(self) -> None:
         """See `Detector`."""
         self.detector.close()
+
+    def _classes(self, found: Evidence) -> tuple[I8, F64 | None]:
+        """Return the class of each evidence, and the share of slipped tips since the alarm."""
+        slip = np.where(found.label == GROSS, GROSS, INCIPIENT)
+        label = np.where(found.value > self.level, slip, NO_SLIP).astype(np.int8)
+        if found.slipped is None:
+            return label, None
+        slipped = found.slipped.copy()
+        for k, share in enumerate(slipped.tolist()):
+            if label[k] == NO_SLIP and not share > 0:
+                self._slipping = False
+            elif label[k] != NO_SLIP:
+                self._slipping = True
+            if self._slipping and share > 0:
+                label[k] = GROSS if share >= ALL_SLIPPED else INCIPIENT
+            elif share > 0:
+                slipped[k] = 0.0
+        return label, slipped
 
     def _windows(self, given: EventChunk, ends_us: list[int]) -> tuple[JudgedWindow, ...]:
         """Return the spans between answers, and count the events of the one that is open."""

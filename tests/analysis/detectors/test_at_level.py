@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,3 +102,30 @@ def test_a_detector_that_fails_is_an_error(value: float, said: str) -> None:
     live = LiveDetector(AtLevel(Saying(value), 0.0), origin_us=0)
     with pytest.raises(DetectorError, match=said):
         live.advance(STEP_US)
+
+
+class Tips(Detector):
+    """Evidence and shares of slipped tips as they are given, one a millisecond."""
+
+    def __init__(self, value: list[float], slipped: list[float]) -> None:
+        self._value, self._slipped = value, np.array(slipped)
+
+    def begin(self, width: int, height: int) -> None:
+        pass
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        found = Evidence.of(1000 * np.arange(1, len(self._value) + 1), self._value)
+        return replace(found, slipped=self._slipped)
+
+
+def test_slip_goes_on_after_an_alarm_for_as_long_as_tips_slip() -> None:
+    nan = np.nan
+    value = [5.0, 0.0, 20.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 20.0, 0.0]
+    share = [0.1, 0.2, 0.0, 0.30, 0.6, 1.0, 0.0, 0.3, nan, 0.98, nan]
+    judged = AtLevel(Tips(value, share), 12.0)
+    judged.begin(640, 480)
+    found = judged.push(EventChunk.empty(), 11_000)
+    assert found.label.tolist() == [0, 0, 1, 1, 1, 2, 0, 0, 0, 2, 0]
+    assert found.slipped is not None
+    shown = [0.0, 0.0, 0.0, 0.30, 0.6, 1.0, 0.0, 0.0, nan, 0.98, nan]
+    assert np.array_equal(found.slipped, shown, equal_nan=True)
