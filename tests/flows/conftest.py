@@ -10,6 +10,7 @@ import os
 import shutil
 import ssl
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,13 @@ _real: dict[str, Any] = {}
 """This worker's server, once a test has asked for it."""
 
 
-@pytest.fixture
-def prefect_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Flows of the test run on an embedded server."""
-    monkeypatch.setattr(orchestration, "_servers", _real)
-    monkeypatch.setattr(orchestration, "_lost_servers", set())
+@pytest.fixture(scope="module")
+def prefect_server() -> Iterator[None]:
+    """Flows of the module's tests run on an embedded server."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(orchestration, "_servers", _real)
+        patch.setattr(orchestration, "_lost_servers", set())
+        yield
 
 
 def tiny() -> dict[str, Any]:

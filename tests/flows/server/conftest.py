@@ -21,6 +21,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield found
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def on_a_server(prefect_server: None) -> None:
     """As `prefect_server`: commands of the tests talk to it as a user's do."""
