@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from sliplab.flows.cli.app import command_line
+from sliplab.flows.running.orchestration import NOWHERE
 from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
@@ -29,7 +30,8 @@ for words in json.loads(sys.argv[1]):
 
 def loaded(*commands: Sequence[str]) -> list[list[str]]:
     """Run commands in a new process; return the modules of plug-ins that are there after each."""
-    said = said_by(LOADED, json.dumps(commands)).splitlines()
+    # without a Prefect server, which takes longer than the commands
+    said = said_by(LOADED, json.dumps(commands), PREFECT_API_URL=NOWHERE).splitlines()
     return [json.loads(line) for line in said if line.startswith("[")]
 
 
