@@ -193,14 +193,6 @@ class PlateTracker:
         return quads[mine[0]] if len(mine) else None
 
 
-def track_plate(
-    frames: Iterable[Frame], marker_id: int | None = None, max_bridged: int = MAX_BRIDGED
-) -> PlateTrack:
-    """The plate's marker through a video; see `PlateTracker` and `bridge`."""
-    tracker = PlateTracker(marker_id)
-    return bridge([tracker.update(frame) for frame in frames], max_bridged)
-
-
 def track_video(
     frames: Iterable[Frame],
     layout_px: Floats,

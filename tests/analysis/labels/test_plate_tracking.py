@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 
 import cv2
@@ -12,7 +13,13 @@ from numpy.typing import NDArray
 from sliplab.analysis.labels import plate_tracking
 from sliplab.analysis.labels.blobs import find_blobs
 from sliplab.analysis.labels.markers import track
-from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge, track_plate
+from sliplab.analysis.labels.plate_tracking import (
+    MAX_BRIDGED,
+    PlatePose,
+    PlateTrack,
+    PlateTracker,
+    bridge,
+)
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
@@ -67,6 +74,14 @@ def dark() -> Frame:
 
 def noisy(frame: Frame, rng: np.random.Generator) -> Frame:
     return np.clip(np.round(frame + rng.normal(0, 1.5, frame.shape)), 0, 255).astype(np.uint8)
+
+
+def track_plate(
+    frames: Iterable[Frame], marker_id: int | None = None, max_bridged: int = MAX_BRIDGED
+) -> PlateTrack:
+    """The plate's marker through a video; see `PlateTracker` and `bridge`."""
+    tracker = PlateTracker(marker_id)
+    return bridge([tracker.update(frame) for frame in frames], max_bridged)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.1, 2.0])
