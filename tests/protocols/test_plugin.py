@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from sliplab.flows.cli.app import command_line
-from sliplab.flows.running.orchestration import NOWHERE
 from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
+from tests.flows.programs import NO_SERVER
 from tests.protocols.planning import said_by
 
 LOADED = """
@@ -30,8 +30,7 @@ for words in json.loads(sys.argv[1]):
 
 def loaded(*commands: Sequence[str]) -> list[list[str]]:
     """Run commands in a new process; return the modules of plug-ins that are there after each."""
-    # without a Prefect server, which takes longer than the commands
-    said = said_by(LOADED, json.dumps(commands), PREFECT_API_URL=NOWHERE).splitlines()
+    said = said_by(LOADED, json.dumps(commands), **NO_SERVER).splitlines()
     return [json.loads(line) for line in said if line.startswith("[")]
 
 

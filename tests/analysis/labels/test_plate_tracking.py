@@ -76,11 +76,9 @@ def noisy(frame: Frame, rng: np.random.Generator) -> Frame:
     return np.clip(np.round(frame + rng.normal(0, 1.5, frame.shape)), 0, 255).astype(np.uint8)
 
 
-def track_plate(
-    frames: Iterable[Frame], marker_id: int | None = None, max_bridged: int = MAX_BRIDGED
-) -> PlateTrack:
+def track_plate(frames: Iterable[Frame], max_bridged: int = MAX_BRIDGED) -> PlateTrack:
     """The plate's marker through a video; see `PlateTracker` and `bridge`."""
-    tracker = PlateTracker(marker_id)
+    tracker = PlateTracker()
     return bridge([tracker.update(frame) for frame in frames], max_bridged)
 
 
@@ -145,8 +143,6 @@ def test_the_first_marker_stays_the_marker() -> None:
     track_ = track_plate([both, other, both])
     assert track_.ok.tolist() == [True, False, True]  # the larger one, and no other in its place
     np.testing.assert_allclose(track_.xy[0], [120, 90], atol=0.2)
-    track_ = track_plate([both, other, both], marker_id=3)
-    np.testing.assert_allclose(track_.xy, [[350, 300], [120, 90], [350, 300]], atol=0.2)
 
 
 def test_a_video_in_one_pass() -> None:
