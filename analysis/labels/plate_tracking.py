@@ -91,8 +91,8 @@ class PlateTracker:
     """Follows one ArUco marker (dictionary 4x4_50) from frame to frame.
 
     Its four sides are followed where they must be, and its cells looked at, so that nothing else is
-    taken for it. Only where that fails does a detector look around there, and then everywhere. It is
-    the largest one in the first frame that has one.
+    taken for it. Only where that fails does a detector look around there, and then everywhere. The
+    plate's is the largest one in the first frame that has one.
     """
 
     def __init__(self) -> None:
