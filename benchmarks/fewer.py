@@ -30,6 +30,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from benchmarks.measure import SEED, Figures
+from benchmarks.one_slide import run_slide
 from benchmarks.twin import CLEAN, pilot_slides, prior_of
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.plugins.claims.document import ClaimState
@@ -42,7 +43,6 @@ from sliplab.protocols.plan import make_plan
 from sliplab.protocols.yaml_file import parse_yaml, validate
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
-from sliplab.rigs.scene.slides import run_slide
 
 F64 = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[1]

@@ -28,13 +28,13 @@ import numpy as np
 
 from benchmarks.emulator import FRAME_NS, emulate, find_emulator
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
+from benchmarks.one_slide import run_slide
 from benchmarks.scene_tradeoff.error import match_events
 from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
 from benchmarks.trials import open_session
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
-from sliplab.rigs.scene.slides import run_slide
 from sliplab.storage.streams import F64, I64, EventChunk
 
 TRIALS = 30

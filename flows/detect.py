@@ -116,6 +116,7 @@ def detect(
     *,
     detector: StreamDetector | None = None,
     build: BuildRig = build_rig,
+    on_step: Callable[[Rig, str], None] = lambda rig, phase: None,
     show: bool = True,
 ) -> DetectSummary:
     """Run a detection to its end; return a summary, with ``interrupted`` if the user ended it.
@@ -125,6 +126,7 @@ def detect(
         detector: that runs, in this process; by default the request's, in a separate process where
             the request has a safe state.
         build: makes the rig.
+        on_step: called with the phase when a step of the trial begins.
         show: show decisions on the terminal.
 
     Raises:
@@ -163,7 +165,8 @@ def detect(
         level = detector.set_by if isinstance(detector, AtLevel) else request.set_by
         if level is not None and not level.promised:
             say(level.words)
-        sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say)
+        stepped = functools.partial(on_step, rig)
+        sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say, stepped)
         rig.connect()
         reaction, interrupted = None, False
         if request.trial is None:

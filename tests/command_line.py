@@ -54,7 +54,7 @@ def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess
 
 
 def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """The same in this process, which has loaded everything and has a server already."""
+    """The same in this process, which has loaded everything already."""
     words = ["sliplab", *map(str, arguments)]
     out, said = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:

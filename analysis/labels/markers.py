@@ -90,27 +90,19 @@ class MarkerTracker:
         layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
         threshold: grey level that parts marker and background where blobs are looked for; Otsu's
             by default.
-        area_tolerance: a marker whose area differs by more than this share from its area in the
-            frames before is lost (hidden, or merged with something bright).
 
     Raises:
         ValueError: the layout is not (m, 2), or two of its markers coincide.
     """
 
-    def __init__(
-        self,
-        layout_px: Floats,
-        *,
-        threshold: int | None = None,
-        area_tolerance: float = AREA_TOLERANCE,
-    ) -> None:
+    def __init__(self, layout_px: Floats, *, threshold: int | None = None) -> None:
         layout = np.array(layout_px, np.float64)
         if layout.ndim != 2 or layout.shape[1] != 2 or len(layout) == 0:
             raise ValueError(f"layout_px has the shape {layout.shape}: must be (markers, 2)")
         self._spacing = float(pdist(layout).min()) if len(layout) > 1 else 100.0
         if not self._spacing > 8:
             raise ValueError(f"layout_px has markers {self._spacing:.1f} px apart: too near")
-        self._layout, self._threshold, self._tolerance = layout, threshold, area_tolerance
+        self._layout, self._threshold = layout, threshold
         m = len(layout)
         self._everywhere = np.ones(m, np.bool_)
         self._everywhere.flags.writeable = False
@@ -179,7 +171,7 @@ class MarkerTracker:
         whole = self._state == WHOLE
         usual = float(np.median(self._measured[whole, AREA])) if whole.any() else area
         self._area = np.where(whole, self._measured[:, AREA], usual)
-        self._look(frame, seen, self._tolerance)
+        self._look(frame, seen, AREA_TOLERANCE)
 
     def _search(self, frame: Frame, shrink: int) -> tuple[Blobs, Floats, NDArray[np.int64]]:
         """Blobs of the frame, the layout's shift, and which blob each marker is.
@@ -204,7 +196,7 @@ class MarkerTracker:
         before = self._xy.copy()
         known = None if self._all_followed else self._state != LOST
         self._xy += self._velocity
-        self._all_followed = not self._look(frame, self._everywhere, self._tolerance)
+        self._all_followed = not self._look(frame, self._everywhere, AREA_TOLERANCE)
         if self._all_followed:
             if known is None:
                 np.subtract(self._xy, before, out=self._velocity)
@@ -268,7 +260,7 @@ class MarkerTracker:
             self._xy[i] = places[int(distance.argmin())]
             only = np.zeros(len(self._xy), np.bool_)
             only[i] = True
-            if self._look(frame, only, self._tolerance):
+            if self._look(frame, only, AREA_TOLERANCE):
                 self._xy[i] = expected
 
     def _find_again(self, frame: Frame) -> bool:
@@ -282,7 +274,7 @@ class MarkerTracker:
         shift = np.median(blobs.xy[index[seen]] - self._xy[seen], axis=0)
         self._xy = np.where(seen[:, None], blobs.xy[index], self._xy + shift)
         self._state[:] = np.where(seen, WHOLE, LOST)
-        self._look(frame, self._everywhere, self._tolerance)
+        self._look(frame, self._everywhere, AREA_TOLERANCE)
         self._velocity[:] = 0.0
         self._missed[:] = 0
         return True

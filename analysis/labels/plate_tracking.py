@@ -91,14 +91,12 @@ class PlateTracker:
     """Follows one ArUco marker (dictionary 4x4_50) from frame to frame.
 
     Its four sides are followed where they must be, and its cells looked at, so that nothing else is
-    taken for it. Only where that fails does a detector look around there, and then everywhere.
-
-    Args:
-        marker_id: the plate's marker; by default the largest one in the first frame that has one.
+    taken for it. Only where that fails does a detector look around there, and then everywhere. The
+    plate's is the largest one in the first frame that has one.
     """
 
-    def __init__(self, marker_id: int | None = None) -> None:
-        self.marker_id = marker_id
+    def __init__(self) -> None:
+        self.marker_id: int | None = None
         self.detections = 0
         """Number of calls of the ArUco detector."""
         settings = cv2.aruco.DetectorParameters()
@@ -193,22 +191,10 @@ class PlateTracker:
         return quads[mine[0]] if len(mine) else None
 
 
-def track_plate(
-    frames: Iterable[Frame], marker_id: int | None = None, max_bridged: int = MAX_BRIDGED
-) -> PlateTrack:
-    """The plate's marker through a video; see `PlateTracker` and `bridge`."""
-    tracker = PlateTracker(marker_id)
-    return bridge([tracker.update(frame) for frame in frames], max_bridged)
-
-
 def track_video(
     frames: Iterable[Frame],
     layout_px: Floats,
     with_plate: bool,
-    *,
-    threshold: int | None = None,
-    marker_id: int | None = None,
-    max_bridged: int = MAX_BRIDGED,
 ) -> VideoTracks:
     """Track papillae and, on request, the plate in one pass over the frames.
 
@@ -216,21 +202,16 @@ def track_video(
         frames: (h, w) uint8 frames in order; each is checked once, and none is retained.
         layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
         with_plate: follow the plate's ArUco marker too.
-        threshold: see `MarkerTracker`.
-        marker_id: see `PlateTracker`.
-        max_bridged: see `bridge`.
     """
-    markers = MarkerTracker(layout_px, threshold=threshold)
-    plate = PlateTracker(marker_id) if with_plate else None
+    markers = MarkerTracker(layout_px)
+    plate = PlateTracker() if with_plate else None
     rows: list[FrameMarkers] = []
     poses: list[PlatePose] = []
     for frame in frames:
         rows.append(markers.update(frame))
         if plate is not None:
             poses.append(plate.update(frame))
-    return VideoTracks(
-        stack_tracks(rows, len(layout_px)), None if plate is None else bridge(poses, max_bridged)
-    )
+    return VideoTracks(stack_tracks(rows, len(layout_px)), None if plate is None else bridge(poses))
 
 
 def bridge(poses: list[PlatePose], max_bridged: int = MAX_BRIDGED) -> PlateTrack:

@@ -145,7 +145,6 @@ def fitted_net(
     epochs: int = EPOCHS,
     seed: int = 0,
     on_epoch: Callable[[int, float], None] | None = None,
-    mirror: bool = True,
     classes: int = len(CLASSES),
     batch: int = BATCH,
 ) -> tuple[nn.Module, dict[str, Any]]:
@@ -157,7 +156,6 @@ def fitted_net(
         epochs: over which the rate falls to nothing along half a cosine.
         seed: of the first weights, the order and the mirrors.
         on_epoch: called with each epoch and its validation accuracy.
-        mirror: windows are mirrored at random, as the spiking network's are.
         classes: that there are.
         batch: windows a step of the optimiser; fewer for few windows.
 
@@ -181,7 +179,7 @@ def fitted_net(
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for done in range(1, epochs + 1):
         rng = np.random.default_rng([seed, done])
-        _one_epoch(net, optimizer, falling, train, rng, mirror, batch)
+        _one_epoch(net, optimizer, falling, train, rng, batch)
         votes = net_votes(net, validation.windows, classes)
         strict = metrics.accuracy(votes, validation.y).strict or 0.0
         loss = float(
@@ -210,14 +208,12 @@ def _one_epoch(
     falling: torch.optim.lr_scheduler.LRScheduler,
     train: SampleSet,
     rng: np.random.Generator,
-    mirror: bool,
     batch: int,
 ) -> None:
     net.train()
     order = rng.permutation(len(train))
-    windows = train.windows
-    if mirror:
-        windows = windows.mirrored(rng.integers(0, 4, len(train), np.uint8))
+    # at random, as the spiking network's are
+    windows = train.windows.mirrored(rng.integers(0, 4, len(train), np.uint8))
     for start in range(0, len(order), batch):
         rows = order[start : start + batch]
         loss = nn.functional.cross_entropy(

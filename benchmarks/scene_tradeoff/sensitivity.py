@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import scene_parameters as assumed
+from benchmarks.one_slide import run_slide
 from benchmarks.scene_parameters import SceneOutcome
 from benchmarks.scene_tradeoff.variants import Variant
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
@@ -25,7 +26,6 @@ from sliplab.rigs.mock.levels import HIGHEST, slides_of, with_level
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.scene.slides import run_slide
 
 CONTACT_TRIALS = 12
 """Trials that onsets are taken from."""

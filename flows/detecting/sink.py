@@ -130,6 +130,7 @@ class DetectSink(NullSink):
         timeouts: beyond which slip cannot be detected in time; None: never reported.
         watch: of the promise of false alarms; None without one.
         on_broken: called once with a text, when the alarms contradict that promise.
+        on_step: called with the phase when a step of the motion begins.
     """
 
     def __init__(
@@ -141,9 +142,10 @@ class DetectSink(NullSink):
         timeouts: Timeouts | None = None,
         watch: PromiseWatch | None = None,
         on_broken: Callable[[str], None] = lambda text: None,
+        on_step: Callable[[str], None] = lambda phase: None,
     ) -> None:
         self.detector, self.phase = detector, ""
-        self._watch, self._on_broken = watch, on_broken
+        self._watch, self._on_broken, self._on_step = watch, on_broken, on_step
         self._declared = self._held = self._moved = False
         self.armed = self.guarded = False
         self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
@@ -162,6 +164,7 @@ class DetectSink(NullSink):
         self.phase, self._declared = phase, True
         self._held = self._held or phase == HOLD
         self._moved = self._held and (self._moved or phase != HOLD)
+        self._on_step(phase)
 
     def add(self, device: str, chunk: Chunk) -> None:
         """Feed the event camera's stream to the detector.

@@ -57,9 +57,8 @@ def sync_level(t_s: float) -> bool:
     return any(0.0 <= t_s - pulse_s(near) < PULSE_S for near in (number - 1, number))
 
 
-def no_load(t_s: float) -> Sequence[float]:
-    """Return force and torque on a tool that touches nothing."""
-    return (0.0,) * 6
+Load = Callable[[float], Sequence[float]]
+"""Force (N) and torque (N m) on the tool, base axes, by the controller's time in s."""
 
 
 class ArmBench(DeviceBench):
@@ -68,11 +67,11 @@ class ArmBench(DeviceBench):
     Args:
         settings: settings of a rig file, with limits in the base frame; the fake listens at its
             address.
+        load: on the tool of an arm that measures it; None: a tool that touches nothing.
 
     Attributes:
         axis: unit vector of turns, none of the base frame's axes.
         twists: True if the driver declares that the arm turns its tool on the spot.
-        load: force (N) and torque (N m) on the tool, base axes, by the controller's time in s.
         wraps_s: times of the fake's clock at which counters wrap, s.
         host_clock: True if the controller has no clock: it reports poses when it is asked.
         sync_read: True once the fake has read the level of its sync input.
@@ -82,7 +81,6 @@ class ArmBench(DeviceBench):
     twists = True
     host_clock = False
     sync_read = False
-    load: Callable[[float], Sequence[float]] = staticmethod(no_load)
     clock: ControllerClock | None = None
     wraps_s: tuple[float, ...] = ()
 
@@ -91,10 +89,11 @@ class ArmBench(DeviceBench):
         driver: ArmDriver[Any],
         settings: BaseArmSettings,
         bounds: Bounds,
-        measures: bool = False,
+        load: Load | None = None,
     ) -> None:
         super().__init__(bounds)
-        self._build = driver.builder(measures)
+        self._build = driver.builder(load is not None)
+        self._load = load or (lambda t_s: (0.0,) * 6)
         if driver.fake is None:
             raise NotTried(f"{driver.name} declares no fake")
         self.driver, self._fake, self.twists = driver, driver.fake, driver.twists
@@ -110,7 +109,7 @@ class ArmBench(DeviceBench):
         motion = StraightMotion(self.home, lambda line, t_s: self._lines.append((t_s, line)))
         self.clock = running_clock(offset_s=clock_s)
         self.sync_read = False
-        scene = ArmScene(motion, self.clock, self._sync, REACH_MM, lambda t_s: self.load(t_s))
+        scene = ArmScene(motion, self.clock, self._sync, REACH_MM, self._load)
         self.fake: FakeController = self._fake(settings, scene)
         self.wraps_s = wraps_s(self.fake)
         self.fake.start()

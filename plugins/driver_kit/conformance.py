@@ -118,7 +118,7 @@ def cases(
     if arm is None:
         return of(lambda: ForceBench(driver, settings, limits), *rules)
     return of(
-        lambda: ArmForceBench(driver, settings, limits, ArmBench(*arm, limits, measures=True)),
+        lambda: ArmForceBench(driver, settings, limits, lambda load: ArmBench(*arm, limits, load)),
         *rules,
     )
 

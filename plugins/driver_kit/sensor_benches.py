@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.plugins.driver_kit.arm_bench import ArmBench
+from sliplab.plugins.driver_kit.arm_bench import ArmBench, Load
 from sliplab.plugins.driver_kit.arm_report import clock_offset_ns
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried, RuleViolation
 from sliplab.plugins.driver_kit.stream_bench import BATCHES, MS_NS, StreamBench
@@ -139,17 +139,24 @@ class SensorBench(StreamBench):
 
 
 class ArmForceBench(StreamBench):
-    """A force sensor that the arm's controller measures: its faults are the arm's."""
+    """A force sensor that the arm's controller measures: its faults are the arm's.
+
+    Args:
+        arm: makes the arm under a load.
+    """
 
     capability = ForceSensor
 
     def __init__(
-        self, driver: ForceSensorDriver[Any], settings: Any, bounds: Bounds, arm: ArmBench
+        self,
+        driver: ForceSensorDriver[Any],
+        settings: Any,
+        bounds: Bounds,
+        arm: Callable[[Load], ArmBench],
     ) -> None:
         super().__init__(driver, settings, bounds)
-        self._arm = arm
-        arm.load = self._load_at
-        self.device = driver.build(settings, arm.arm)
+        self._arm = arm(self._load_at)
+        self.device = driver.build(settings, self._arm.arm)
 
     load = LOAD
     steady = False

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, StreamDetector
@@ -29,8 +28,8 @@ from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
-from sliplab.protocols.program import ACTING, Move, Step
-from sliplab.rigs.build import ShouldStop, build_rig
+from sliplab.protocols.program import ACTING, Move
+from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.loopback.rig import loopback_rig
@@ -216,27 +215,15 @@ class Seen:
     truth: Truth | None = None
     course: PlateCourse | None = None
 
-    def by(self, build: BuildRig) -> BuildRig:
-        """Return a function that builds the same rig, observed."""
-
-        def observed(file: RigFile, should_stop: ShouldStop) -> Rig:
-            rig = build(file, should_stop)
-            take_step = rig.take_step
-
-            def looking(index: int, step: Step, *rest: Any) -> Any:
-                assert rig.simulation is not None
-                if step.phase in ACTING and self.began_ns is None:
-                    rig.simulation.watch_plate()
-                    self.began_ns = rig.arm.now_ns()
-                elif step.phase == "release" and self.began_ns is not None:
-                    self.truth = rig.simulation.truth(self.began_ns)
-                    self.course = rig.simulation.plate_course(self.began_ns)
-                return take_step(index, step, *rest)
-
-            rig.take_step = looking  # type: ignore[assignment,method-assign]
-            return rig
-
-        return observed
+    def look(self, rig: Rig, phase: str) -> None:
+        """Look at the simulation as a step begins."""
+        assert rig.simulation is not None
+        if phase in ACTING and self.began_ns is None:
+            rig.simulation.watch_plate()
+            self.began_ns = rig.arm.now_ns()
+        elif phase == "release" and self.began_ns is not None:
+            self.truth = rig.simulation.truth(self.began_ns)
+            self.course = rig.simulation.plate_course(self.began_ns)
 
 
 def measure(
@@ -259,7 +246,7 @@ def measure(
         detector = detectors[case.detector]
     seen = Seen()
     order = replace(wanted, trial=trial)
-    summary = detect(order, detector=detector, build=seen.by(build), show=False)
+    summary = detect(order, detector=detector, build=build, on_step=seen.look, show=False)
     truth, course = seen.truth, seen.course
     assert truth is not None
     assert course is not None

@@ -1,6 +1,6 @@
 """Does what a page says, in order: writes its files, makes its changes, runs its commands.
 
-Commands run in this process, which has loaded the libraries and has a Prefect server already.
+Commands run in this process, which has loaded the libraries already.
 """
 
 from __future__ import annotations

@@ -10,9 +10,11 @@ import os
 import shutil
 import ssl
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from tests.conftest import ROOT, SMALL
@@ -25,7 +27,8 @@ os.environ["PREFECT_HOME"] = _HOME
 from sliplab.analysis.report.sources import report_folder  # noqa: E402
 from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
-from sliplab.flows.running import parallel_map  # noqa: E402
+from sliplab.flows.running import orchestration, parallel_map, run_records  # noqa: E402
+from sliplab.flows.running.embedded_server import ServerError  # noqa: E402
 from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
 from sliplab.flows.study import StudyOutcome, study  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
@@ -39,6 +42,40 @@ configure_prefect(Path(_HOME))
 ssl.create_default_context = functools.cache(ssl.create_default_context)
 # other tests have the other cores; in a fresh clone the first trial takes that long by its kernels
 parallel_map.START_S = math.inf
+
+
+class NoServer:
+    """In place of the embedded server: flows run as they do when it is lost, and say nothing.
+
+    A server costs a worker of the tests minutes of a processor. What it is told is tested by those
+    in `tests/flows/running` and `tests/flows/server`, and by whole programs.
+    """
+
+    alive = answers = True
+    address = orchestration.NOWHERE
+
+    def settings(self) -> dict[Any, str]:
+        """Prefect's settings, which there are none of."""
+        raise ServerError("tests have none unless they ask for it")
+
+    def stop(self) -> None:
+        """End nothing."""
+
+
+_no_server: Any = NoServer()
+orchestration._servers[_HOME] = _no_server
+orchestration._lost_servers.add(run_records.EMBEDDED)
+_real: dict[str, Any] = {}
+"""This worker's server, once a test has asked for it."""
+
+
+@pytest.fixture(scope="module")
+def prefect_server() -> Iterator[None]:
+    """Flows of the module's tests run on an embedded server."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(orchestration, "_servers", _real)
+        patch.setattr(orchestration, "_lost_servers", set())
+        yield
 
 
 def tiny() -> dict[str, Any]:

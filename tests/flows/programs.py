@@ -12,6 +12,9 @@ from typing import Any
 
 from tests.conftest import ROOT
 
+NO_SERVER = {"PREFECT_API_URL": "http://127.0.0.1:9/api"}
+"""Where no server answers: starting one takes longer than many a program's work."""
+
 
 def environment(**changes: str) -> dict[str, str]:
     """Return what a program is started with."""

@@ -14,6 +14,7 @@ from sliplab.flows.cli.app import command_line
 from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
+from tests.flows.programs import NO_SERVER
 from tests.protocols.planning import said_by
 
 LOADED = """
@@ -29,7 +30,7 @@ for words in json.loads(sys.argv[1]):
 
 def loaded(*commands: Sequence[str]) -> list[list[str]]:
     """Run commands in a new process; return the modules of plug-ins that are there after each."""
-    said = said_by(LOADED, json.dumps(commands)).splitlines()
+    said = said_by(LOADED, json.dumps(commands), **NO_SERVER).splitlines()
     return [json.loads(line) for line in said if line.startswith("[")]
 
 

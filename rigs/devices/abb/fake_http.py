@@ -39,8 +39,7 @@ class HttpServer:
     """An HTTP server; clients without an answer wait until it is closed."""
 
     def __init__(self, host: str, port: int, answer: Answer) -> None:
-        self._server = _RobotServer((host, port), _Handler)
-        self._server.answer = answer
+        self._server = _RobotServer((host, port), answer)
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.02,), daemon=True
         )
@@ -68,10 +67,10 @@ class _RobotServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
-    answer: Answer
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, address: tuple[str, int], answer: Answer) -> None:
+        super().__init__(address, _Handler)
+        self.answer = answer
         self.released = threading.Event()
         self.nonce = secrets.token_hex(16)
         self._open: set[socket.socket] = set()

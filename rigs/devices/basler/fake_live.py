@@ -4,10 +4,14 @@ Every frame of the scene is one software trigger of the emulated camera, so it p
 pylon's own buffers, threads and results; only the image, its number and its chunks, which the
 emulation lacks, come from the scene. A frame that pylon loses is lost here too. Settings that the
 scene's images do not simulate are refused, and so is a grab while one is active.
+
+The emulation (pylon 12.4) has image sizes, formats, software triggers, free run, images from a
+folder, failed buffers and exposure-end events, but no chunks, line triggers or readable clock.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
@@ -16,8 +20,25 @@ from typing import Any
 
 from sliplab.rigs.core.driver import SceneFrames
 from sliplab.rigs.devices.basler.driver import find_camera
-from sliplab.rigs.devices.basler.fake import EMULATED, emulate
 from sliplab.storage.streams import U8, FrameChunk
+
+EMULATED = "BaslerCamEmu"
+"""pylon's device class of emulated cameras."""
+
+
+def emulate(cameras: int = 1) -> None:
+    """Make pylon list `cameras` emulated cameras in this process and its children.
+
+    Raises:
+        RuntimeError: pylon was loaded before, and does not enumerate again.
+    """
+    os.environ["PYLON_CAMEMU"] = str(cameras)
+    from pypylon import pylon
+
+    found = pylon.TlFactory.GetInstance().EnumerateDevices()
+    there = sum(info.GetDeviceClass() == EMULATED for info in found)
+    if there < cameras:
+        raise RuntimeError(f"{there} emulated cameras instead of {cameras}: pylon loaded first")
 
 
 class CameraFeature:

@@ -21,7 +21,7 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import SLIPLAB, answer, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.programs import environment, running
+from tests.flows.programs import NO_SERVER, environment, running
 
 pytestmark = pytest.mark.programs
 
@@ -33,7 +33,7 @@ def collecting(
 ) -> AbstractContextManager[subprocess.Popen[str]]:
     """`sliplab collect` in a process of its own."""
     command = ("collect", protocol, "--rig", RIG, "--store", store, "--json")
-    return running([*SLIPLAB, *command], log)
+    return running([*SLIPLAB, *command], log, environment(**NO_SERVER))
 
 
 def slides(folder: Path, degrees: Iterable[int]) -> Path:

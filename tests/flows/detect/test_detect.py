@@ -212,9 +212,7 @@ def test_a_false_alarm_in_the_hold_moves_nothing(model: Path, protocol: Path) ->
     assert result["reflex"]["phase"] == "slide"
 
 
-def test_a_reflex_in_a_retraction_keeps_the_plate(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reflex_in_a_retraction_keeps_the_plate(model: Path, tmp_path: Path) -> None:
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}
     protocol = write(tmp_path / "g.yaml", data)
@@ -222,27 +220,22 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
     order = make_detect_request(RIG, model, protocol=protocol, **options)
     rigs: list[Rig] = []
     truth: list[dict[str, Any]] = []
+    begun = [0]
 
-    def build(file: RigFile, should_stop: ShouldStop) -> Rig:
-        rig = keeping(rigs)(file, should_stop)
-        take_step, begun = rig.take_step, [0]
+    def look(rig: Rig, phase: str) -> None:
+        assert rig.simulation is not None
+        if phase == "retract":
+            begun[0] = rig.arm.now_ns()
+        if phase == "release":
+            truth.append(rig.simulation.truth(begun[0]))
 
-        def looking(index: int, step: Any, *rest: Any) -> Any:
-            assert rig.simulation is not None
-            if step.phase == "retract":
-                begun[0] = rig.arm.now_ns()
-            if step.phase == "release":
-                truth.append(rig.simulation.truth(begun[0]))
-            return take_step(index, step, *rest)
-
-        monkeypatch.setattr(rig, "take_step", looking)
-        return rig
-
-    result = detect(order, detector=scripted(order, slip_when_busy(80)), build=build)
+    scripts = scripted(order, slip_when_busy(80))
+    result = detect(order, detector=scripts, build=keeping(rigs), on_step=look)
     assert result["reflex"]["phase"] == "retract"
     assert [found["gross_ns"] for found in truth] == [None]  # the plate never fell
+    scripts = scripted(order, slip_when_busy(80))
     watched = detect(
-        replace(order, reflex=None), detector=scripted(order, slip_when_busy(80)), build=build
+        replace(order, reflex=None), detector=scripts, build=keeping(rigs), on_step=look
     )
     assert watched["reflex"] is None
     assert truth[1]["gross_ns"] is not None

@@ -338,7 +338,7 @@ def test_limits_of_force_hold_for_grips(gripping: Gripping) -> None:
 # -- the network's process -------------------------------------------------------------------
 
 
-def test_the_network_in_its_process_is_the_network(model: Path) -> None:
+def test_the_network_in_its_process_is_the_network_and_a_hang_ends_in_time(model: Path) -> None:
     from sliplab.analysis.detectors.network_detector import counting_of
 
     windows = untrained().windows
@@ -349,16 +349,7 @@ def test_the_network_in_its_process_is_the_network(model: Path) -> None:
     with pytest.raises(NetworkLost):  # a window that is none: the process survives it
         network(x[:, :1, :, :3])
     network(x)
-    network.close()
-    with pytest.raises(NetworkLost, match="has exited"):
-        network(x)
-
-
-def test_a_network_that_hangs_is_given_up_in_time(model: Path) -> None:
-    windows = untrained().windows
-    x = np.zeros((1, windows.steps, windows.channels, windows.cells, windows.cells), np.uint8)
-    network = NetworkProcess(model, 0.5)
-    network(x)
+    network._answer_s = 0.5
     os.kill(network.pid, signal.SIGSTOP)
     with pytest.raises(NetworkLost, match=r"no answer within 0\.5 s"):
         network(x)

@@ -20,7 +20,7 @@ from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from tests.command_line import SLIPLAB, answer, here
 from tests.conftest import ROOT
-from tests.flows.programs import ended, environment
+from tests.flows.programs import NO_SERVER, ended, environment
 
 ODD = "lab.db?new #2 50%41 'q' [x]:\n"
 SOCKS = {"ALL_PROXY": "socks5://127.0.0.1:9"}
@@ -194,7 +194,10 @@ def test_text_that_is_not_utf_8_is_one_line_where_it_cannot_be_kept(tmp_path: Pa
     [
         ({**SOCKS, **POSIX}, 0, ""),
         ({"PREFECT_API_REQUEST_TIMEOUT": "abc"}, 2, "Prefect's settings cannot be read: "),
-        ({"PREFECT_HOME": "/proc/none"}, 0, "cannot be written"),
+        # `test_server_loss` has another server that cannot start
+        pytest.param(
+            {"PREFECT_HOME": "/proc/none"}, 0, "cannot be written", marks=pytest.mark.long
+        ),
     ],
 )
 def test_command_in_an_odd_environment(
@@ -232,7 +235,7 @@ print(len(list(store)))
 def test_label_in_a_script_without_a_guard_collects_once(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     command = (sys.executable, tmp_path / "script.py", tmp_path / "store")
-    done = ended(command, 300, cwd=tmp_path)
+    done = ended(command, 300, cwd=tmp_path, env=environment(**NO_SERVER))
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["1"]
     (campaign,) = Store.open(tmp_path / "store").campaigns()

@@ -19,3 +19,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         found = Service(page, folder / "store")
         until("the page", lambda: found.ask("GET", "/log")[0] == 401)
         yield found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def on_a_server(prefect_server: None) -> None:
+    """As `prefect_server`: commands of the tests talk to it as a user's do."""

@@ -32,13 +32,15 @@ EVIL = "http://evil.example"
 FINAL = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 
 
-def until(what: str, found: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
+def until(
+    what: str, found: Callable[[], Any], limit_s: float = LIMIT_S, pause_s: float = 0.05
+) -> Any:
     """Return the result of `found` as soon as it is truthy."""
     end = time.monotonic() + limit_s
     pause = threading.Event()
     while not (answer := found()):
         assert time.monotonic() < end, f"waited {limit_s:g} s for {what}"
-        pause.wait(0.05)
+        pause.wait(pause_s)
     return answer
 
 
@@ -113,7 +115,8 @@ class Page:
 
     def ended(self, run: str) -> Any:
         """Its last state, waited for."""
-        until(f"the end of {run}", lambda: self.state(run)["type"] in FINAL)
+        # each question costs the server more than a collection that waits
+        until(f"the end of {run}", lambda: self.state(run)["type"] in FINAL, pause_s=0.5)
         return self.state(run)
 
     def cancel(self, run: str) -> None:
@@ -149,7 +152,7 @@ def serving(
         environment |= {"PREFECT_API_URL": server[0], "PREFECT_API_AUTH_STRING": server[1]}
     with log.open("w") as output:
         process = subprocess.Popen(
-            [*command, "--name", name, "--poll", "0.3"],
+            [*command, "--name", name, "--poll", "0.6"],
             cwd=ROOT,
             env=environment,
             stdout=output,

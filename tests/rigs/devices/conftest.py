@@ -20,7 +20,7 @@ from sliplab.rigs.devices import ur
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.settings import AbbSettings
-from sliplab.rigs.devices.basler.fake import emulate
+from sliplab.rigs.devices.basler.fake_live import emulate
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.fake import FakeUr
 from sliplab.rigs.devices.ur.settings import UrSettings

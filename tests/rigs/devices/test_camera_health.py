@@ -12,11 +12,11 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
+from benchmarks.basler_emulation import unplug
+from benchmarks.dvxplorer_server import DvxplorerServer, arrays
 from sliplab.rigs.core.capabilities import DeviceHealth, EventCamera, FrameCamera, RigError
 from sliplab.rigs.devices import basler, dvxplorer
-from sliplab.rigs.devices.basler.fake import unplug
 from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, arrays
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
 from sliplab.rigs.devices.dvxplorer.source import DvxEventSource
 from sliplab.storage.streams import EventChunk

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer
+from benchmarks.dvxplorer_server import DvxplorerServer
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.live import rig_yaml, stage_of
+from tests.flows.programs import environment
 
 PARENT = """
 import time
-from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer
+from benchmarks.dvxplorer_server import DvxplorerServer
 
 if __name__ == "__main__":
     print(DvxplorerServer(list, realtime=False)._process.pid, flush=True)
@@ -58,7 +59,8 @@ def test_dvxplorer_server_survives_signals_of_the_terminal() -> None:
 def test_fakes_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as parent:
+    command = [sys.executable, str(script)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment()) as parent:
         assert parent.stdout is not None
         server = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from benchmarks.one_slide import run_slide
 from sliplab.rigs.scene.friction import friction_field, friction_knots, grip_at
-from sliplab.rigs.scene.slides import run_slide
 from sliplab.rigs.scene.springs import make_springs
 from tests.rigs.scene.steps import MU, ideal_skin
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.one_slide import SlideRun, run_slide
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
-from sliplab.rigs.scene.slides import SlideRun, run_slide
 
 DEPTHS = (2.4, 2.6, 2.8, 3.0, 3.2, 3.4)
 SPEEDS = (0.6, 0.8, 1.0, 1.2, 1.4, 1.6)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.one_slide import run_slide
 from sliplab.rigs.scene.friction import friction_knots
 from sliplab.rigs.scene.onsets import Material, retraction_onsets, slide_onsets
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
-from sliplab.rigs.scene.slides import run_slide
 from sliplab.rigs.scene.springs import make_springs, new_tips
 from tests.rigs.scene.steps import MU, H, fall, ideal_skin, line, run, slid
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.slides import SlideRun, run_slide
+from benchmarks.one_slide import SlideRun, run_slide
 from sliplab.rigs.scene.springs import SHORTER, Springs
 from tests.rigs.scene.steps import MU, RICH, at, fall, ideal_skin, places, pressed, run, springs_of
 

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+# Prefect at home in a folder of the tests, before anything imports it
+import tests.flows.conftest  # noqa: F401
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.adapter import Adapter
 from sliplab.storage.formats.export_trials import export_trials
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
-from tests.command_line import here, sliplab
+from tests.command_line import here
 from tests.storage.formats.adapters import bring
 
 TABLE = {"files": "{kind}/trial{n}.csv", "format": "csv", "unit": "s"}
@@ -114,7 +116,7 @@ def test_later_steps_give_a_result_or_one_line(campaign: Campaign, tmp_path: Pat
         done = here("export", store, "pressures", "--output", tmp_path / kind, "--format", kind)
         assert (done.returncode, done.stderr.count("error: ")) == (2, 1)
         assert said in done.stderr
-    done = sliplab("train", store)
+    done = here("train", store)
     assert done.returncode == 1
     assert "campaign 'pressures' was recorded without events" in done.stderr
 

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.rigs.core.capabilities import FrameCamera, RigError
-from sliplab.rigs.devices.basler.driver import BaslerCamera, find_camera
-from sliplab.rigs.devices.basler.fake import (
+from benchmarks.basler_emulation import (
     LossyDevice,
     fail_buffers,
     scene_frames,
@@ -20,6 +18,8 @@ from sliplab.rigs.devices.basler.fake import (
     unplug,
     write_frames,
 )
+from sliplab.rigs.core.capabilities import FrameCamera, RigError
+from sliplab.rigs.devices.basler.driver import BaslerCamera, find_camera
 from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.storage.streams import FrameChunk
 

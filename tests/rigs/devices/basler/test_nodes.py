@@ -197,7 +197,7 @@ def test_a_value_that_a_setting_does_not_have_is_named_with_those_that_it_has() 
 
 def test_of_several_cameras_one_must_be_named() -> None:
     code = (
-        "from sliplab.rigs.devices.basler.fake import emulate; emulate(2); "
+        "from sliplab.rigs.devices.basler.fake_live import emulate; emulate(2); "
         "from sliplab.rigs.devices.basler.driver import find_device_info; "
         "print(find_device_info('0815-0001').GetSerialNumber()); find_device_info(None)"
     )

@@ -13,9 +13,9 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
+from benchmarks.dvxplorer_server import DvxplorerServer, Sent, arrays, scene
 from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
-from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, Sent, arrays, scene
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream, UsbCamera
 from sliplab.rigs.devices.dvxplorer.source import DvxEventSource, check_taken, configure, in_force
 from sliplab.storage.streams import I64, EventChunk

@@ -1,14 +1,11 @@
-"""A fake Basler camera: pylon's own camera emulation, with images and losses on request.
+"""pylon's own camera emulation with images and losses on request.
 
-The real driver runs on the real pylon; only the camera is emulated (pylon 12.4). The emulation has
-image sizes, formats, software triggers, free run, images from a folder, failed buffers and
-exposure-end events. It has no chunks, line triggers or readable clock, and under load it slows down
-where a camera would lose frames: `LossyDevice` loses frames instead.
+The real driver runs on the real pylon; only the camera is emulated (pylon 12.4). Under load the
+emulation slows down where a camera would lose frames: `LossyDevice` loses frames instead.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +14,6 @@ import numpy as np
 
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.storage.streams import U8
-
-VARIABLE = "PYLON_CAMEMU"
-EMULATED = "BaslerCamEmu"
-"""pylon's device class of emulated cameras."""
-
-
-def emulate(cameras: int = 1) -> None:
-    """Make pylon list `cameras` emulated cameras in this process and its children.
-
-    Raises:
-        RuntimeError: pylon was loaded before, and does not enumerate again.
-    """
-    os.environ[VARIABLE] = str(cameras)
-    from pypylon import pylon
-
-    found = pylon.TlFactory.GetInstance().EnumerateDevices()
-    there = sum(info.GetDeviceClass() == EMULATED for info in found)
-    if there < cameras:
-        raise RuntimeError(f"{there} emulated cameras instead of {cameras}: pylon loaded first")
 
 
 def scene_frames(count: int, width: int, height: int, seed: int = 1) -> U8:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliplab.plugins.driver_kit.broken import Broken
 from sliplab.plugins.driver_kit.examples import arm, events, force, frames, gripper, sync
 from sliplab.plugins.driver_kit.examples.arm.driver import ExampleArm
 from sliplab.plugins.driver_kit.examples.events.driver import ExampleEvents
@@ -28,6 +27,7 @@ from sliplab.rigs.core.capabilities import ArmState, Pose, Progress
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.storage.streams import EventChunk, PoseChunk
+from tests.plugins.driver_kit.broken import Broken
 
 Change = Callable[[Any], Any]
 COUNTER = 1 << 32
