@@ -23,12 +23,14 @@ from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import FORGIVEN, Campaign, Store
 from sliplab.storage.trials.verify import content_problems, verify_trial
-from tests.storm.sent import Column, differences
+from tests.storm.sent import differences
 from tests.storm.steps import NAME
 
 LATER = {"cause.json"}
 """Files of an attempt in quarantine that a request may change."""
 DEVICES = {"events": "event_camera", "frames": "frame_camera", "arm": "arm"}
+GAP_S = 0.1
+"""How long an event camera may see nothing in a slide."""
 STRAY_MM = 0.1
 """How far poses may lie from their path for noise."""
 TIMES = {"95 %": 3.0}
@@ -208,6 +210,9 @@ class Ledger:
         self._check_record(name, record, read_json(folder / PROVENANCE))
         start_us, end_us = recording.step("hold")
         self._rates[name] = len(recording.events(start_us, end_us)) / (end_us - start_us)
+        events = recording.events(*recording.step("slide")).t_us
+        gap_s = float(np.diff(events).max(initial=0)) / 1e6
+        self._sent[name]["gap_s"] = gap_s
         states = record.trial, record.seed, json.dumps(record.condition, default=str)
         if states != (name, trial.seed, json.dumps(self._describe(trial), default=str)):
             raise Wrong("a record is true", f"{name}: states {states}")
@@ -215,6 +220,11 @@ class Ledger:
         if record.attempt != len(attempts):
             what = f"{name}: is attempt {record.attempt} after {len(attempts)}"
             raise Wrong("a record is true", what)
+        for item in Campaign(self._campaign).quarantined():
+            mine = item["trial"] == name and str(item["cause"]).startswith(("gate", "again"))
+            if mine and aside[item["folder"]].get("data.h5") == self._sum(folder / "data.h5"):
+                what = f"{name} and quarantine/{item['folder']} have the same data"
+                raise Wrong("each attempt has its own seed", what)
         skin = read_json(folder / PROVENANCE).get("skin")
         if skin != self._skins[name]:
             raise Wrong("a record is true", f"{name}: skin {skin}, {self._skins[name]} was logged")
@@ -272,14 +282,23 @@ class Ledger:
             if gate.startswith("sync_uncertainty"):
                 sync = asked.sync_uncertainty
                 timing = record.timing.rig if record.timing else None
-                assert timing is not None and found.grade is not None
+                assert timing is not None
+                assert found.grade is not None
                 limits[gate] = sync.limit_s(gated_as(found.grade, timing))
+                known = record.clocks.devices()
+                device = gate.removeprefix("sync_uncertainty_").removesuffix("_s")
+                both = {device, "events"} & {*known}
+                true = sum(float(known[each].uncertainty_ns or 0) for each in both) / 1e9
+                if not abs(value - true) <= 1e-6 * true:
+                    what = f"{name}: {gate} = {value}, its clocks state {true}"
+                    raise Wrong("a gate sees what was recorded", what)
             if not (found.passed and 0 <= value <= limit == float(limits.get(gate, limit))):
                 what = f"{name}: {gate} = {value}, limit {limit}, asked {limits.get(gate)}"
                 raise Wrong("what is committed passed its gates", what)
         for key, value, limit in (
             ("strayed_mm", seen["strayed_mm"], 1.2 * float(asked.path_deviation) + STRAY_MM),
             ("lost", seen["lost"], asked.frames_lost),
+            ("gap_s", seen["gap_s"], float(asked.event_gap) + GAP_S),
         ):
             if not value <= limit:
                 raise Wrong("a gate sees what was recorded", f"{name}: {key} = {value}")
@@ -466,7 +485,8 @@ class Ledger:
         by_person = {item["trial"] for item in one.excluded if item["by"] is not None}
         skipped = self._skipped() - there
         # a kill may have come between what was asked and its answer
-        half = {trial for each in control.open_requests(self._status._store) for trial in each.trials}
+        waiting = control.open_requests(Store.open(self._folder))
+        half = {trial for each in waiting for trial in each.trials}
         if by_person - half != skipped - half:
             what = f"{sorted(by_person)} are skipped, asked and answered were {sorted(skipped)}"
             raise Wrong("requests are carried out", what)

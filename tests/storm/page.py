@@ -231,6 +231,38 @@ async def _play(page: Page, served: ServedRuns, rig: UUID, words: UUID, rng: ran
             page.wrong("a service ends with its run", process.run.name)
 
 
+def _close_left(page: Page, store: Path, rig: UUID, rng: random.Random) -> None:
+    """What a killed program left is closed by the next start, on its own server alone."""
+    run_records.is_here = lambda process: False  # type: ignore[attr-defined]
+    wanted: dict[UUID, str] = {}
+    for _ in range(4):
+        page.due(rig)
+        run = [*page.runs.values()][-1]
+        kind, server = rng.choice(("killed", "owed", "told")), rng.choice(("page", "other"))
+        run_records.begin(store, str(run.id), "collect", f"http://{server}")
+        run.state = Completed() if kind == "told" else Running()
+        wanted[run.id] = "RUNNING" if server == "other" and kind != "told" else "COMPLETED"
+        if kind != "killed":
+            run_records.end(store, str(run.id), "COMPLETED", "it says so", "it")
+        elif server == "page":
+            wanted[run.id] = "CRASHED"
+        if kind == "owed":
+            run_records.record_undelivered_end(store, str(run.id), "COMPLETED", "it says so")
+
+    def report(run: str, state: Any, force: bool) -> None:
+        page.runs[UUID(run)].state = state
+
+    client = SimpleNamespace(
+        read_flow_run=lambda run: page.runs[UUID(run)], set_flow_run_state=report
+    )
+    run_records.close_killed_runs(store, "http://page", client)
+    for made, state in wanted.items():
+        known = page.runs[made].state.type.value
+        ended = (run_records.end_of(store, str(made)) or {"state": "RUNNING"})["state"]
+        if known != state or (state == "CRASHED") != (ended == "CRASHED"):
+            page.wrong("what was killed is closed", f"{known}, {ended}, and not {state}")
+
+
 def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     """Let runs come due, be cancelled and end, while the page is lost and comes back."""
     rng = random.Random(seed)
@@ -245,6 +277,7 @@ def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     flow = SimpleNamespace(name="collect")
     served = ServedRuns(store, {rig: flow}, {words: flow})
     asyncio.run(_play(page, served, rig, words, rng))
+    _close_left(page, store, rig, rng)
     notes.add(served=len(page.runs))
 
 

@@ -470,7 +470,8 @@ def probe(process: Process, step: dict[str, Any]) -> None:
         with rig.safely(at):
             rig.begin_trial(at, 0)
             for deeper_mm, farther_mm, angle, share in step["places"]:
-                depth_mm, reach_mm = float(limits.depth) + deeper_mm, float(limits.reach) + farther_mm
+                depth_mm = float(limits.depth) + deeper_mm
+                reach_mm = float(limits.reach) + farther_mm
                 to = Position(reach_mm * math.cos(angle), reach_mm * math.sin(angle), depth_mm)
                 allowed = deeper_mm < 0 and farther_mm < 0 and 0 < share <= 1
                 try:

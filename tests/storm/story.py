@@ -131,9 +131,15 @@ def _rig(rng: random.Random) -> dict[str, Any]:
         # close around the motion, so that leaving the path is leaving the limits
         "limits": {"depth": "3.4 mm", "speed": "50 mm/s", "reach": "9 mm"},
     }
+    rig["timing"] = {"code": rng.choice(["lfsr", "lfsr", "irregular", "regular"])}
+    if rng.random() < 0.3:
+        grades = ["exposure line", "device time stamps", "host arrival"]
+        rig["timing"]["frames"] = rng.choice(grades)
+    if rng.random() < 0.15:
+        rig["timing"]["arm"] = "host time"
     if rng.random() < 0.3:
         delay = {"shortest_us": 0, "longest_us": 4000}
-        rig["timing"] = {"force": {"grade": "host time", "delay": delay}}
+        rig["timing"]["force"] = {"grade": "host time", "delay": delay}
         rig["mock"]["force"] = {"rate_hz": 500}
         if rng.random() < 0.5:
             rig["limits"]["force"] = "12 N"
@@ -162,9 +168,12 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
         kind = rng.choice([*FAULTS])
         if kind in ALONE and any(fault["kind"] == kind for fault in found):
             continue
+        wired = story["rig"]["timing"].get("arm") != "host time"
         if kind == "stream_gone" and "streams" not in story["rig"]:
             continue
         fault = {"kind": kind, **FAULTS[kind](rng)}
+        if not wired and kind.startswith("pulses") and fault["device"] == "arm":
+            continue
         if "force" in story["rig"]["mock"] and kind in OF_ANY and rng.random() < 0.3:
             fault["device"] = "force_sensor"
         if rng.random() < 0.8:
@@ -184,7 +193,8 @@ def _weather(rng: random.Random, share: float = 0.45) -> dict[str, Any]:
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
     if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
-        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": rng.choice(rng.choice([COMMIT, NAMES]))}
+        name = rng.choice(rng.choice([COMMIT, NAMES]))
+        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": name}
         cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
     drawn: list[Step] = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import ArmState, Segment
+from sliplab.rigs.core.guard import MEASURED_MM
 from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.core.rig import Rig
@@ -56,7 +58,7 @@ BLIND_MM = 1.5
 READS = {
     MockArm: ("read_poses", "read_pulses"),
     MockEventCamera: ("read", "read_pulses"),
-    MockFrameCamera: ("read",),
+    MockFrameCamera: ("read", "read_clock"),
     MockSyncBox: ("read_pulses", "read_clock"),
     MockForceSensor: ("read",),
     MockThermometer: ("read",),
@@ -95,6 +97,7 @@ class Witness:
         self._asked_s: float | None = None
         self._starts = 0
         self._outside: tuple[float, float] | None = None
+        self._began_over = 0.0
         self._handed: Counter[str] | None = None
         self._zeroed = False
         self._corners: list[Any] = []
@@ -155,6 +158,7 @@ class Witness:
         start_streams: Any = Rig.start_streams
         stop_streams: Any = Rig.stop_streams
         press: Any = Rig.press
+        retract: Any = Rig._retract
         zero = MockForceSensor.zero
         self.lie.install()
         self._count_reads()
@@ -170,7 +174,7 @@ class Witness:
                 self.wrong("no motion after a stop", f"it is sent on in {state.value}")
             self._segment, self._lied_s, self._blind = path[-1], None, None
             # what is sent from a false pose goes to a false place, which nothing here can know
-            self._misled = self.lie.active in FALSE_PLACES
+            self._misled = self._is_false
 
         def zeroing(sensor: MockForceSensor) -> None:
             zero(sensor)
@@ -178,6 +182,11 @@ class Witness:
             deep_mm = float(_place(sensor._world)[2])
             if self._calm and not deep_mm < 0:
                 self.wrong("forces are zeroed clear of the plate", f"{deep_mm:.2f} mm deep")
+
+        def retracting(rig: Rig, *given: Any) -> Any:
+            if self._asked_s is None:  # it is sent once, and straight, whatever made it stop
+                self._asked_s, self._starts = self._host.passed_s, 0
+            return retract(rig, *given)
 
         def pressing(rig: Rig, *given: Any) -> None:
             press(rig, *given)
@@ -211,9 +220,13 @@ class Witness:
             took_s = self._host.passed_s - self._streams_s
             stop_streams(rig, sink)
             handed, self._handed = self._handed, None
-            if isinstance(sink, Tee) and handed is not None and +handed != +sink.rows:
-                self.wrong("what is handed over is stored", f"{handed}, stored {sink.rows}")
+            for kind, rows in (handed or {}).items() if isinstance(sink, Tee) else ():
+                if rows != sink.rows[kind]:
+                    what = f"{rows} rows of {kind}, stored are {sink.rows[kind]}"
+                    self.wrong("what is handed over is stored", what)
             for name, rate_hz in RATES_HZ.items() if isinstance(sink, Tee) and self._calm else ():
+                if name == "frames/t" and rig.timing.frames != "hardware trigger":
+                    continue  # it runs by itself
                 rows = sink.columns[name][0]
                 if not rows >= rate_hz * took_s - 2:
                     self.wrong("what happened is recorded", f"{rows} rows of {name} in {took_s} s")
@@ -242,6 +255,7 @@ class Witness:
         MockArm.start = starting  # type: ignore[method-assign]
         MockForceSensor.zero = zeroing  # type: ignore[method-assign]
         Rig.press = pressing  # type: ignore[method-assign]
+        Rig._retract = retracting  # type: ignore[method-assign]
         SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
         Rig.run_trial = running  # type: ignore[method-assign]
         Rig.rezero = rezeroing  # type: ignore[method-assign]
@@ -331,6 +345,7 @@ class Witness:
 
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
         here = _place(world)
+        self._began_over = self._excess(here) + MEASURED_MM
         before = self._segment
         if before is not None and world.path.moving(world.now_ns):
             off_mm = math.dist(here, world.plane.sensor(before.to)[:3])
@@ -341,16 +356,22 @@ class Witness:
             there = world.plane.sensor(segment.to)
             if self._asked_s is not None:
                 self._starts += 1
-                aside = math.dist(here[:2], there[:2])
-                if self._starts > 1 or aside > 0.5 or there[2] > here[2] + 0.01:
+                aside, deeper = math.dist(here[:2], there[:2]), there[2] - here[2]
+                astray = not (aside <= 0.5 and deeper <= 0.01) and not self._is_false
+                if self._starts > 1 or astray:
                     self.wrong(
                         "no motion after a stop",
                         f"move {self._starts} goes {aside:.2f} mm aside to {there[2]:.2f} mm deep",
                     )
             if not 0 < segment.speed_mm_s <= self._speed_mm_s + 1e-6:
                 self.wrong("within limits", f"is sent at {segment.speed_mm_s} mm/s")
-            if self.lie.active not in FALSE_PLACES:
+            if not self._is_false:
                 self._check_place(there, here, "is sent")
+
+    @property
+    def _is_false(self) -> bool:
+        """Whether the arm reports to be elsewhere, so that what is sent from there goes astray."""
+        return self.lie.active in FALSE_PLACES
 
     def _excess(self, place: Any) -> float:
         """Return how far a place on the true plate is beyond the limits, mm."""
@@ -428,7 +449,8 @@ class Witness:
             if late > self._poll_s + 1e-3:
                 self.wrong("stops in time", f"still moves {late:.3f} s after it was asked to stop")
         over = self._excess(place)
-        if not (moving and over > PLATE_MM) or self._misled:
+        # a path that begins outside leads back, and may go as far again on its way
+        if not (moving and over > max(PLATE_MM, self._began_over)) or self._misled:
             self._outside = None
         elif self._outside is None or over <= self._outside[1]:  # it may come back
             self._outside = now_s, over
@@ -453,7 +475,7 @@ def _place(world: SimulatedWorld) -> Any:
 def _strayed_mm(places: Any, corners: Any) -> float:
     """Return the largest distance of places (n, 3) from the lines between corners (m, 3)."""
     nearest = np.full(len(places), np.inf)
-    for begin, end in zip(corners[:-1], corners[1:], strict=True):
+    for begin, end in pairwise(corners):
         way = end - begin
         share = np.clip((places - begin) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
         away = np.linalg.norm(places - begin - share[:, None] * way, axis=1)
