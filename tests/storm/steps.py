@@ -54,6 +54,7 @@ from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
+from tests.storm.alerts import watch
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
 
@@ -544,6 +545,13 @@ def serve(process: Process, step: dict[str, Any]) -> None:
         serve(process.stage.store, process.notes, step["seed"], step["lost"])
 
 
+def alert(process: Process, step: dict[str, Any]) -> None:
+    """Tell people what happens to the store."""
+    if Store.exists(process.stage.store):
+        store = Store.open(process.stage.store)
+        watch(store, process.host, process.notes, step["seed"], step["lost"])
+
+
 DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "night": night,
     "ask": ask,
@@ -558,5 +566,6 @@ DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "carry": carry,
     "react": react,
     "probe": probe,
+    "alert": alert,
 }
 """What each kind of step does."""

@@ -325,7 +325,8 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "record": (0.4, _record),
     "carry": (0.4, _carry),
     "react": (0.3, _react),
-    "probe": (0.3, _probe),
+    "probe": (0.6, _probe),
+    "alert": (0.4, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 FOLLOWS = {
