@@ -241,7 +241,8 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
         if event["signal"] == "dropped":  # its exception was lost in a destructor
             stopping.request()
         else:
-            os.kill(os.getpid(), getattr(signal, event["signal"]))
+            # to this thread: another one may get a process's signal, and later
+            signal.raise_signal(getattr(signal, event["signal"]))
     elif "clock" in event:
         process.host.wall_s += event["clock"]
     elif "fill" in event:
