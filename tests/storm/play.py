@@ -155,6 +155,8 @@ class Player:
             import_module("tests.storm.page")  # here, once for all processes
 
         def work() -> None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup lets them be ignored
             host.install()
             try:
                 Process(stage, host, notes).run(step)

@@ -29,7 +29,10 @@ def _device(rng: random.Random, *but: str) -> dict[str, Any]:
 
 FAULTS: dict[str, Draw] = {
     "arm_protective_stop": lambda rng: {},
-    "arm_off_path": lambda rng: {"mm": rng.choice([0.3, 3, 10]), "seconds": rng.choice([0.3, 2])},
+    "arm_off_path": lambda rng: {
+        "mm": rng.choice([0.3, 0.5, 3, 10]),
+        "seconds": rng.choice([0.3, 2]),
+    },
     "frames_lost": lambda rng: {"count": rng.choice([1, 5])},
     "frame_late": lambda rng: {"seconds": rng.choice([0.05, 0.5])},
     "event_gap": lambda rng: {"seconds": rng.choice([0.02, 0.3])},
@@ -68,6 +71,12 @@ NAMES = (
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
+SHARP = (
+    *("arm_protective_stop", "arm_off_path", "frames_lost", "frame_late", "event_gap"),
+    *("event_stall", "clock_drift", "clock_jump", "clock_restart", "pulses_lost"),
+    *("pulses_duplicated", "pulses_late", "disk_full", "device_gone", "stream_gone"),
+)
+"""Kinds that a gate or a watch is there for; they are drawn more often."""
 OF_ANY = {"clock_drift", "clock_jump", "device_gone"}
 """Kinds that a force sensor has, too."""
 ALONE = {"mains_light", "arm_ramp"}
@@ -161,11 +170,11 @@ def _trial_s(story: Story) -> float:
 # -- steps ---------------------------------------------------------------------------------------
 
 
-def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
-    """Draw none to three faults of a night."""
+def _faults(rng: random.Random, story: Story, trials: int = 4) -> list[dict[str, Any]]:
+    """Draw none to three faults of a night that takes so many trials."""
     found: list[dict[str, Any]] = []
     for _ in range(rng.choice([0, 0, 1, 1, 2, 3])):
-        kind = rng.choice([*FAULTS])
+        kind = rng.choice([*FAULTS, *SHARP, *SHARP])
         if kind in ALONE and any(fault["kind"] == kind for fault in found):
             continue
         wired = story["rig"]["timing"].get("arm") != "host time"
@@ -177,7 +186,7 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
         if "force" in story["rig"]["mock"] and kind in OF_ANY and rng.random() < 0.3:
             fault["device"] = "force_sensor"
         if rng.random() < 0.8:
-            fault["trial"] = rng.randint(1, 6)
+            fault["trial"] = rng.randint(1, trials + 2)  # a touch counts as one
         if kind not in WHOLE_TRIALS:
             fault["at_s"] = round(rng.uniform(0, rng.choice([4, _trial_s(story)])), 2)
         if kind not in WHOLE_TRIALS and rng.random() < 0.3:
@@ -252,7 +261,7 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
             events.append({"at_s": end_s, "ask": "resume"})
     window = {"window_s": round(rng.uniform(0, 1.2 * night_s), 1)} if rng.random() < 0.15 else {}
     return {
-        "faults": _faults(rng, story),
+        "faults": _faults(rng, story, most or trials),
         "events": sorted(events, key=lambda event: event["at_s"]),
         "most": most,
         **window,
