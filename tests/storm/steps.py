@@ -259,7 +259,7 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
     else:
         try:
             if "log" in event:
-                witness.skin_logged = _log(process, event["log"]) or witness.skin_logged
+                _log(process, event["log"])
             else:
                 _file_request(process, event)
         except (OSError, StoreError, InputError) as error:
@@ -324,16 +324,15 @@ def log(process: Process, step: dict[str, Any]) -> None:
         _log(process, step)
 
 
-def _log(process: Process, step: dict[str, Any]) -> bool:
-    """Log a note, or a skin; return whether it is a skin."""
+def _log(process: Process, step: dict[str, Any]) -> None:
+    """Log a note, or a skin."""
     store = Store.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
-        return False
+        return
     add_note(store, text, who="anna", context=context)
     process.notes.add(logged=text, at_s=process.host.wall_s, **(context or {}))
-    return context is not None
 
 
 def check(process: Process, step: dict[str, Any]) -> None:

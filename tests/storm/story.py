@@ -146,11 +146,11 @@ def _rig(rng: random.Random) -> dict[str, Any]:
         rig["timing"]["frames"] = rng.choice(grades)
     if rng.random() < 0.15:
         rig["timing"]["arm"] = "host time"
-    if rng.random() < 0.3:
+    if rng.random() < 0.4:
         delay = {"shortest_us": 0, "longest_us": 4000}
         rig["timing"]["force"] = {"grade": "host time", "delay": delay}
         rig["mock"]["force"] = {"rate_hz": 500}
-        if rng.random() < 0.5:
+        if rng.random() < 0.6:
             rig["limits"]["force"] = "12 N"
     if rng.random() < 0.3:
         thermometer = {"kind": "scalar", "unit": "degC", "mock": {"rate_hz": 20}}
@@ -240,7 +240,7 @@ def _event(rng: random.Random, story: Story, trials: int, night_s: float) -> Ste
         {"fill": rng.choice([0, RESERVE + 2000, RESERVE + 20_000])},
         _lie(rng, story),
     ]
-    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 1, 5])[0]
+    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 1, 7])[0]
     return {"at_s": round(rng.uniform(0, 1.1 * night_s), 2), **made}
 
 

@@ -29,6 +29,7 @@ from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials import control
+from sliplab.storage.trials.context import SKIN, LoggedContext
 from tests.storm.lies import FALSE_PLACES, Lie
 from tests.storm.sent import Tee
 from tests.storm.virtual import Host, Notes
@@ -102,7 +103,8 @@ class Witness:
         self._zeroed = False
         self._corners: list[Any] = []
         self._blind: tuple[Any, float] | None = None
-        self.resumed, self.skin_logged = True, False
+        self.resumed = True
+        self._skin: str | None = None
         self._plan: Plan | None = None
         self._slot: int | None = None
         self._pressed = 0
@@ -301,8 +303,9 @@ class Witness:
                 self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
             if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
                 self.wrong("requests are carried out", "continues in spite of a stop")
-            if self.skin_logged or self.resumed:
-                self.resumed, self.skin_logged, self._pressed = True, False, 0
+            skin = LoggedContext(store, campaign.name).read().get(SKIN)
+            if self.resumed or skin != self._skin:
+                self.resumed, self._skin, self._pressed = True, skin, 0
             if rezeroes and (slot := plan.rezero_task(trial).slot) not in slots[-1:]:
                 slots.append(slot)
                 self._slot = slot  # until depth zero is found for it
