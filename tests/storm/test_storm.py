@@ -40,9 +40,9 @@ def test_every_kind_of_step_is_drawn() -> None:
 
 
 def test_no_invariant_is_broken_and_a_seed_is_one_story_with_one_trace() -> None:
-    both, other = storm("--seed=1", "--stories=2"), storm("--seed=2", "--stories=1")
-    assert both["failed"] == []
-    assert both["hashes"]["2"] == other["hashes"]["2"]
+    one, other = (storm("--seed=40", "--stories=1") for _ in range(2))
+    assert one["failed"] == []
+    assert one["hashes"] == other["hashes"]
 
 
 def test_a_planted_defect_is_found() -> None:
