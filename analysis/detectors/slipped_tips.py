@@ -64,8 +64,9 @@ def regions(place_of_cells: I64, columns: int) -> I64:
 
 def _centres(cell: npt.NDArray[np.complex128], number: I64) -> npt.NDArray[np.complex128]:
     """Return the mean cell of each number; columns are real, rows imaginary."""
-    size = np.bincount(number)
-    return (np.bincount(number, cell.real) + 1j * np.bincount(number, cell.imag)) / size
+    centres = np.zeros(number.max() + 1, np.complex128)
+    np.add.at(centres, number, cell)
+    return centres / np.bincount(number)
 
 
 class SlippedTips:

@@ -138,7 +138,9 @@ class MockFrameCamera:
         self._next_tick += len(ticks)
         self._number += len(ticks)
         self._arrived_ns = max(self._arrived_ns, int(host.max(initial=0)))
-        retained = ~self._faults.lost(ticks)
+        # who reads later than the scene is remembered has lost these frames
+        begin_ns = world.physics.track.begin_ns
+        retained = ~self._faults.lost(ticks) & (true[: len(ticks)] >= begin_ns)
         mid = true[: len(ticks)][retained] + self.mid_exposure_ns
         ticks, number, host = ticks[retained], number[retained], host[retained]
         stamp = host

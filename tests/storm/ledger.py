@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.quality import gated_as
 from sliplab.flows.log import log_entries
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.status import StatusReader
@@ -21,12 +23,16 @@ from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import FORGIVEN, Campaign, Store
 from sliplab.storage.trials.verify import content_problems, verify_trial
-from tests.storm.sent import Column, differences
+from tests.storm.sent import differences
 from tests.storm.steps import NAME
 
 LATER = {"cause.json"}
 """Files of an attempt in quarantine that a request may change."""
 DEVICES = {"events": "event_camera", "frames": "frame_camera", "arm": "arm"}
+GAP_S = 0.1
+"""How long an event camera may see nothing in a slide."""
+STRAY_MM = 0.1
+"""How far poses may lie from their path for noise."""
 TIMES = {"95 %": 3.0}
 """Times its stated uncertainty up to which a clock's error is accepted, by what that states."""
 
@@ -58,12 +64,13 @@ class Ledger:
         self._plan = {trial.id: trial for trial in request.plan}
         self._describe = request.plan.describe
         self._retakes = request.plan.protocol.collection.gates.retakes
-        gate = request.plan.protocol.collection.gates.reference
+        self._gates = request.plan.protocol.collection.gates
+        gate = self._gates.reference
         self._drift_percent = None if gate is None else float(gate.event_rate)
         self._rates: dict[str, float] = {}
         self._skin = request.rig.skin.serial
         self._skins: dict[str, str] = {}
-        self._sent: dict[str, dict[str, Column]] = {}
+        self._sent: dict[str, dict[str, Any]] = {}
         self.takes: dict[str, list[Sums]] = {}
         self._pulled: dict[str, Sums] = {}
         self.spoilt: set[str] = set()
@@ -78,7 +85,7 @@ class Ledger:
         self.counts: Counter[str] = Counter()
         self.again: Counter[str] = Counter()
         self.failed: Counter[str] = Counter()
-        self.logged: list[str] = []
+        self.logged: dict[str, float] = {}
         self.asked: dict[int, str] = {}
         self._known: dict[tuple[Any, ...], str] = {}
         self._status: StatusReader | None = None
@@ -126,9 +133,9 @@ class Ledger:
             if "begins" in note:
                 self._skins[note["begins"]] = self._skin
             if "recorded" in note:
-                self._sent[note["recorded"]] = note["sent"]
+                self._sent[note["recorded"]] = note
             if "logged" in note:
-                self.logged.append(note["logged"])
+                self.logged[note["logged"]] = note["at_s"]
                 self._skin = note.get("skin", self._skin)
             if "number" in note:
                 self.asked[note["number"]] = note["asked"]
@@ -178,6 +185,8 @@ class Ledger:
                 raise Wrong("nothing committed is lost or changed", f"{name}: no request for it")
         for name in sorted(now.keys() - moving):
             if self.trials.get(name) == now[name]:
+                if name in self.damaged:  # once more, which has changed nothing
+                    self.damaged[name] = self.damaged[name][0], now[name]
                 continue
             if name in self.damaged:
                 how, sums = self.damaged.pop(name)
@@ -193,13 +202,17 @@ class Ledger:
         folder = self._campaign / "trials" / name
         for problem in verify_trial(folder):
             raise Wrong("what is committed is whole", f"{name}: {problem.what}")
-        for text in differences(folder, self._sent[name]):
+        for text in differences(folder, self._sent[name]["sent"]):
             raise Wrong("what was sent is stored", f"{name}: {text}")
         recording = Recording(folder)
         record = recording.record
         trial = self._plan[name]
+        self._check_record(name, record, read_json(folder / PROVENANCE))
         start_us, end_us = recording.step("hold")
         self._rates[name] = len(recording.events(start_us, end_us)) / (end_us - start_us)
+        events = recording.events(*recording.step("slide")).t_us
+        gap_s = float(np.diff(events).max(initial=0)) / 1e6
+        self._sent[name]["gap_s"] = gap_s
         states = record.trial, record.seed, json.dumps(record.condition, default=str)
         if states != (name, trial.seed, json.dumps(self._describe(trial), default=str)):
             raise Wrong("a record is true", f"{name}: states {states}")
@@ -207,16 +220,17 @@ class Ledger:
         if record.attempt != len(attempts):
             what = f"{name}: is attempt {record.attempt} after {len(attempts)}"
             raise Wrong("a record is true", what)
+        for item in Campaign(self._campaign).quarantined():
+            mine = item["trial"] == name and str(item["cause"]).startswith(("gate", "again"))
+            if mine and aside[item["folder"]].get("data.h5") == self._sum(folder / "data.h5"):
+                what = f"{name} and quarantine/{item['folder']} have the same data"
+                raise Wrong("each attempt has its own seed", what)
         skin = read_json(folder / PROVENANCE).get("skin")
         if skin != self._skins[name]:
             raise Wrong("a record is true", f"{name}: skin {skin}, {self._skins[name]} was logged")
         if not record.simulated or not Campaign(self._campaign).info["simulated"]:
             raise Wrong("nothing simulated is unmarked", name)
-        for gate, found in record.quality.gates.items():
-            value, limit = found.value, found.limit
-            clock = gate.startswith("sync_uncertainty")
-            if not found.passed or (clock and not float(value or 0) <= float(limit or 0)):
-                raise Wrong("what is committed passed its gates", f"{name}: {gate} = {value}")
+        self._check_gates(name, record)
         truth = (record.simulation_truth or {}).get("clocks", {})
         for device, clock in record.clocks.devices().items():
             pairs = np.array(truth.get(DEVICES.get(device, device), ()))
@@ -228,6 +242,66 @@ class Ledger:
             if error > TIMES.get(clock.kind or "", 1.0) * clock.uncertainty_ns + 1:
                 what = f"{name}: {device} is {error:.0f} ns off, stated {clock.uncertainty_ns:.0f}"
                 raise Wrong("no time is wrong beyond its interval", what)
+
+    def _check_record(self, name: str, record: TrialRecord, provenance: dict[str, Any]) -> None:
+        """Hold what a record states against what the witness saw."""
+        seen, trial = self._sent[name], self._plan[name]
+        rows = {column: count for column, (count, _) in seen["sent"].items()}
+        counted = record.counts
+        for key, true_s in zip(("started", "ended"), seen["times"], strict=True):
+            if not abs(datetime.fromisoformat(provenance[key]).timestamp() - true_s) < 0.01:
+                raise Wrong("a record is true", f"{name}: {key} {provenance[key]}, not {true_s}")
+        for key, states, true in (
+            ("counts.events", counted.events, rows.get("events/t", 0)),
+            ("counts.frames", counted.frames, rows.get("frames/t", 0)),
+            ("counts.poses", counted.poses, rows.get("poses/t", 0)),
+            ("counts.pulses", counted.pulses, rows.get("sync_pulses/t", 0)),
+            ("depth_zero_mm", record.depth_zero_mm, seen["zero_mm"]),
+            ("steps", [[step.phase, step.recorded] for step in record.steps], seen["phases"]),
+            ("role", record.role, trial.role),
+            ("block", record.block, trial.block),
+            ("repetition", record.repetition, trial.repetition),
+        ):
+            if states != true:
+                raise Wrong("a record is true", f"{name}: {key} = {states}, not {true}")
+
+    def _check_gates(self, name: str, record: TrialRecord) -> None:
+        """Every gate of the protocol was applied, with its limit, to what was recorded."""
+        gates, seen, asked = record.quality.gates, self._sent[name], self._gates
+        limits = {
+            "frames_lost": asked.frames_lost,
+            "event_gap_s": asked.event_gap,
+            "event_burst": asked.event_burst,
+            "path_deviation_mm": asked.path_deviation,
+            "speed_deviation_percent": asked.speed_deviation,
+        }
+        for gate in {*limits, *(f"sync_uncertainty_{device}_s" for device in DEVICES)} - {*gates}:
+            raise Wrong("what is committed passed its gates", f"{name}: {gate} was not applied")
+        for gate, found in gates.items():
+            value, limit = float(found.value or 0), float(found.limit or 0)
+            if gate.startswith("sync_uncertainty"):
+                sync = asked.sync_uncertainty
+                timing = record.timing.rig if record.timing else None
+                assert timing is not None
+                assert found.grade is not None
+                limits[gate] = sync.limit_s(gated_as(found.grade, timing))
+                known = record.clocks.devices()
+                device = gate.removeprefix("sync_uncertainty_").removesuffix("_s")
+                both = {device, "events"} & {*known}
+                true = sum(float(known[each].uncertainty_ns or 0) for each in both) / 1e9
+                if not abs(value - true) <= 1e-6 * true:
+                    what = f"{name}: {gate} = {value}, its clocks state {true}"
+                    raise Wrong("a gate sees what was recorded", what)
+            if not (found.passed and 0 <= value <= limit == float(limits.get(gate, limit))):
+                what = f"{name}: {gate} = {value}, limit {limit}, asked {limits.get(gate)}"
+                raise Wrong("what is committed passed its gates", what)
+        for key, value, limit in (
+            ("strayed_mm", seen["strayed_mm"], 1.2 * float(asked.path_deviation) + STRAY_MM),
+            ("lost", seen["lost"], asked.frames_lost),
+            ("gap_s", seen["gap_s"], float(asked.event_gap) + GAP_S),
+        ):
+            if not value <= limit:
+                raise Wrong("a gate sees what was recorded", f"{name}: {key} = {value}")
 
     def _check_references(self, before: set[str], notes: list[dict[str, Any]]) -> None:
         """Nothing is taken after a reference trial that has drifted.
@@ -271,6 +345,9 @@ class Ledger:
         self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
         self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
         forgiven = any("again" in note.values() for note in notes)
+        places = [note["place"] for note in notes if "begins" in note]
+        if places != sorted(places) and not forgiven:
+            raise Wrong("trials are taken in the plan's order", f"{places}")
         for note in notes:
             count = self.failed[note.get("begins", "")]
             if count > self._retakes and not forgiven:
@@ -378,10 +455,10 @@ class Ledger:
         entries = log_entries(store, faults)
         if faults:
             raise Wrong("a log is true", faults[0].replace(str(self._folder), ""))
-        texts = [entry.text for entry in entries]
-        for text in self.logged:
-            if not any(text in line for line in texts):
-                raise Wrong("a log is true", f"lacks '{text}'")
+        for text, at_s in self.logged.items():
+            when = [entry.when for entry in entries if text in entry.text]
+            if not any(abs(datetime.fromisoformat(each).timestamp() - at_s) <= 1 for each in when):
+                raise Wrong("a log is true", f"has '{text}' at {when or 'no time'}")
         there = {request.number: request.kind for request in control.requests(store)}
         for number, kind in self.asked.items():
             if there.get(number) != kind:
@@ -407,7 +484,10 @@ class Ledger:
             raise Wrong("a status is true", f"says {counts}, there are {len(there)}")
         by_person = {item["trial"] for item in one.excluded if item["by"] is not None}
         skipped = self._skipped() - there
-        if by_person != skipped:
+        # a kill may have come between what was asked and its answer
+        waiting = control.open_requests(Store.open(self._folder))
+        half = {trial for each in waiting for trial in each.trials}
+        if by_person - half != skipped - half:
             what = f"{sorted(by_person)} are skipped, asked and answered were {sorted(skipped)}"
             raise Wrong("requests are carried out", what)
         both = [kind for _, kind in sorted(self.asked.items()) if kind in {"pause", "resume"}]
@@ -420,6 +500,9 @@ class Ledger:
         for request in control.requests(store):
             did = ((control.answered(store, request) or {}).get("did") or {}).get("trials", {})
             for trial, text in did.items():
+                place = text.partition("quarantine/")[2].partition(";")[0]
+                if place and place not in self.aside:
+                    raise Wrong("requests are carried out", f"{trial}: {text}")
                 if request.kind == "skip" and "set aside" in text:
                     found.add(trial)
                 elif request.kind == "again":

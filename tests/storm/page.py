@@ -15,7 +15,7 @@ from uuid import UUID
 from zoneinfo import ZoneInfo
 
 from prefect.client.schemas.responses import SetStateStatus
-from prefect.states import Cancelling, Completed, Running, Scheduled
+from prefect.states import Cancelled, Cancelling, Completed, Running, Scheduled
 
 from sliplab.flows.running import run_records
 from sliplab.flows.server import runs, schedules
@@ -46,12 +46,15 @@ class _Process:
 
     Attributes:
         ends_s: when it ends by itself. silent: it is killed, and says nothing. deaf: to a signal.
+        stops_s: how long it takes to stop. said: how it said that it ended.
     """
 
     run: Any
     ends_s: float
     silent: bool
     deaf: bool
+    stops_s: float
+    said: str = ""
     returncode: int | None = None
     asked_s: float | None = None
 
@@ -108,7 +111,10 @@ class Page:
         if any(each.run is run for each in self.processes):
             self.wrong("a run is carried out once", run.name)
         ends_s = self.now_s + rng.uniform(1, 40)
-        made = _Process(run, ends_s, silent=rng.random() < 0.2, deaf=rng.random() < 0.3)
+        if not run.state.is_pending():
+            self.wrong("what is cancelled is not begun", f"{run.name} is {run.state.type.value}")
+        silent, deaf = rng.random() < 0.2, rng.random() < 0.3
+        made = _Process(run, ends_s, silent, deaf, rng.choice([0.0, 0.0, 3.0, 20.0]))
         self.processes.append(made)
         run.state = Running()
         run_records.begin(self._store, str(run.id), command[5], "http://page", "")
@@ -119,7 +125,7 @@ class Page:
 
             def terminate(self) -> None:
                 made.asked_s = page.now_s if made.asked_s is None else made.asked_s
-                if not made.deaf:
+                if not made.deaf and not made.stops_s:
                     page.end(made, "CANCELLED", -15)
 
             def kill(self) -> None:
@@ -127,13 +133,18 @@ class Page:
                     page.wrong("a run has its time to stop the arm", run.name)
                 page.end(made, "", -9)
 
+            async def wait(self) -> None:
+                page.tick()
+                if made.returncode is None:
+                    raise TimeoutError
+
         return Shown()
 
     def end(self, process: _Process, state: str, code: int) -> None:
         """End a process, which records how unless it was killed."""
         if process.returncode is not None:
             return
-        process.returncode = code
+        process.returncode, process.said = code, state
         if state:
             run_records.end(self._store, str(process.run.id), state, "it says so", "it")
 
@@ -141,18 +152,26 @@ class Page:
         """Let a second pass."""
         self.now_s += POLL_S
         for process in self.processes:
-            if process.returncode is None and self.now_s > process.ends_s:
-                if process.deaf and process.asked_s is not None:
-                    continue  # it hangs in its stop
+            if process.returncode is not None:
+                continue
+            asked_s = process.asked_s
+            if asked_s is not None and process.deaf:
+                continue  # it hangs in its stop
+            if self.now_s > process.ends_s:
                 if process.silent:
                     self.end(process, "", -9)
                 else:
                     self.end(process, "COMPLETED", 0)
                     if self._rng.random() < 0.7:  # else the page was lost to it, too
                         process.run.state = Completed()
+            elif asked_s is not None and self.now_s >= asked_s + process.stops_s:
+                self.end(process, "CANCELLED", -15)
 
     def cancel(self) -> None:
-        """A person cancels a run that is on the rig."""
+        """A person cancels a run that is on the rig, or is to be."""
+        for run in self.runs.values():
+            if run.state.is_pending() and not any(each.run is run for each in self.processes):
+                run.state = Cancelled()
         for process in self.processes:
             if process.returncode is None and process.run.state.is_running():
                 process.run.state = Cancelling()
@@ -194,14 +213,61 @@ async def _play(page: Page, served: ServedRuns, rig: UUID, words: UUID, rng: ran
         if known is not None and known["state"] != run.state.type.value:
             what = f"{run.name} is {run.state.type.value}, it ended as {known['state']}"
             page.wrong("the page says how a run ended", what)
+    for process in page.processes:
+        state = process.run.state.type.value
+        if process.said not in {"", state}:
+            what = f"{process.run.name} is {state}, it ended as {process.said}"
+            page.wrong("the page says how a run ended", what)
     if len({*answered}) != len(answered):
         page.wrong("a run is carried out once", f"{answered}")
+    page.lost = 0.0
+    page.due(rig)  # while it is carried out, the service ends
+    for _ in range(3):
+        page.tick()
+        await served._look(page, threads)
+    await served._stop()
+    for process in page.processes:
+        if process.returncode is None:
+            page.wrong("a service ends with its run", process.run.name)
+
+
+def _close_left(page: Page, store: Path, rig: UUID, rng: random.Random) -> None:
+    """What a killed program left is closed by the next start, on its own server alone."""
+    run_records.is_here = lambda process: False  # type: ignore[attr-defined]
+    wanted: dict[UUID, str] = {}
+    for _ in range(4):
+        page.due(rig)
+        run = [*page.runs.values()][-1]
+        kind, server = rng.choice(("killed", "owed", "told")), rng.choice(("page", "other"))
+        run_records.begin(store, str(run.id), "collect", f"http://{server}")
+        run.state = Completed() if kind == "told" else Running()
+        wanted[run.id] = "RUNNING" if server == "other" and kind != "told" else "COMPLETED"
+        if kind != "killed":
+            run_records.end(store, str(run.id), "COMPLETED", "it says so", "it")
+        elif server == "page":
+            wanted[run.id] = "CRASHED"
+        if kind == "owed":
+            run_records.record_undelivered_end(store, str(run.id), "COMPLETED", "it says so")
+
+    def report(run: str, state: Any, force: bool) -> None:
+        page.runs[UUID(run)].state = state
+
+    client = SimpleNamespace(
+        read_flow_run=lambda run: page.runs[UUID(run)], set_flow_run_state=report
+    )
+    run_records.close_killed_runs(store, "http://page", client)
+    for made, state in wanted.items():
+        known = page.runs[made].state.type.value
+        ended = (run_records.end_of(store, str(made)) or {"state": "RUNNING"})["state"]
+        if known != state or (state == "CRASHED") != (ended == "CRASHED"):
+            page.wrong("what was killed is closed", f"{known}, {ended}, and not {state}")
 
 
 def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     """Let runs come due, be cancelled and end, while the page is lost and comes back."""
     rng = random.Random(seed)
     _check_windows(rng, notes)
+    _check_begins(rng, notes)
     page = Page(rng, notes, store, lost)
     runs.monotonic = lambda: page.now_s  # type: ignore[attr-defined]
     runs.asyncio = SimpleNamespace(  # type: ignore[attr-defined]
@@ -211,6 +277,7 @@ def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     flow = SimpleNamespace(name="collect")
     served = ServedRuns(store, {rig: flow}, {words: flow})
     asyncio.run(_play(page, served, rig, words, rng))
+    _close_left(page, store, rig, rng)
     notes.add(served=len(page.runs))
 
 
@@ -229,3 +296,23 @@ def _check_windows(rng: random.Random, notes: Notes) -> None:
             moment += timedelta(minutes=30)
         if found.timestamp() != moment.timestamp():
             notes.add(wrong="a window ends as it says", what=f"{due} {day} {clock} {zone}: {found}")
+
+
+def _check_begins(rng: random.Random, notes: Notes) -> None:
+    """Begins of windows, against a search by half hours."""
+    due = datetime.fromtimestamp(1_795_000_020 + 60 * rng.randrange(600_000), UTC)
+    days, zone = rng.sample(schedules.DAYS, 2), rng.choice(ZONES)
+    clock = f"{rng.choice([6, 22]):02d}:{rng.choice([0, 30]):02d}"
+    cron = schedules.cron_of(days, clock)
+    item = schedules.Scheduled(
+        name="nights", flow="collect", cron=cron, timezone=zone, active=True, parameters={}
+    )
+    found = [each.timestamp() for each in schedules._runs_of(item, 3, due)]
+    moment, wanted = due + timedelta(minutes=30 - due.minute % 30), list[float]()
+    while len(wanted) < 3:
+        wall = moment.astimezone(ZoneInfo(zone))
+        if f"{wall:%H:%M}" == clock and schedules.DAYS[wall.weekday()] in days:
+            wanted.append(moment.timestamp())
+        moment += timedelta(minutes=30)
+    if found != wanted:
+        notes.add(wrong="a window begins as it says", what=f"{due} {days} {clock} {zone}")

@@ -190,15 +190,6 @@ def unmarked() -> None:
 
 
 @plant
-def interval_narrow() -> None:
-    """The stated uncertainty of a clock is a twentieth of what it is."""
-    made = synchronise.DeviceSync.record
-    synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
-        replace(self, uncertainty_ns=self.uncertainty_ns / 20)
-    )
-
-
-@plant
 def clock_gate_open() -> None:
     """The gate of the clocks accepts everything."""
     found = quality.sync_gate
@@ -283,13 +274,6 @@ def status_counts_parts() -> None:
 def answer_early() -> None:
     """A request is answered without being carried out."""
     requests.control.skip = lambda where, trials, by: dict.fromkeys(trials, "set aside")  # type: ignore[attr-defined]
-
-
-@plant
-def incomplete_counts() -> None:
-    """A committed trial that lost a file still counts as one."""
-    checksums.incomplete = lambda folder: None  # type: ignore[assignment]
-    store.incomplete = lambda folder: None  # type: ignore[attr-defined]
 
 
 # -- a second set: defects that came to mind after the storm was written ---------------------------
@@ -529,3 +513,143 @@ def end_guessed() -> None:
             runs.run_records.end_of = end_of
 
     runs.ServedRuns._close = guessing  # type: ignore[method-assign]
+
+
+# -- a fourth set: what gates, limits, references, forgiveness and the server do -------------------
+
+
+@plant
+def force_normal_only() -> None:
+    """A force beyond the limit stops the arm only where it presses on the plate."""
+    check = force_watch.ForceWatch._check_limit
+    force_watch.ForceWatch._check_limit = lambda self, forces: check(self, forces * [0, 0, 1])  # type: ignore[method-assign]
+
+
+@plant
+def path_unjudged() -> None:
+    """The gate of the path takes every path for a straight one."""
+    quality.path_deviation_mm = lambda *given: 0.0
+
+
+@plant
+def gap_unjudged() -> None:
+    """The gate of the events' gaps sees none."""
+    quality.longest_silence_s = lambda *given, **named: 0.0
+
+
+@plant
+def delays_short() -> None:
+    """A message is thought to arrive within a tenth of its longest delay."""
+    sent = synchronise._sent
+
+    def short(device_ns: Any, arrived_ns: Any, delay: Any) -> Any:
+        tenth = delay.model_copy(update={"longest_us": 0.1 * delay.longest_us})
+        return sent(device_ns, arrived_ns, tenth)
+
+    synchronise._sent = short
+
+
+@plant
+def forgives_nothing() -> None:
+    """A trial that is asked for again keeps its failed attempts."""
+    control._reset_attempts = lambda *given: 0
+
+
+@plant
+def retracts_home() -> None:
+    """After a failure the arm leaves towards the plate's centre, and not straight out."""
+    made = rig.Position
+    retract = rig.Rig._retract
+
+    def homewards(self: rig.Rig, clear: Any, error: BaseException) -> Any:
+        rig.Position = lambda x, y, depth: made(clear.x_mm, clear.y_mm, depth)  # type: ignore[attr-defined]
+        try:
+            return retract(self, clear, error)
+        finally:
+            rig.Position = made  # type: ignore[attr-defined]
+
+    rig.Rig._retract = homewards  # type: ignore[method-assign]
+
+
+@plant
+def seed_of_first() -> None:
+    """Every attempt at a trial has the seed of the first one."""
+    hashed = session.hash_integer
+
+    def first(seed: int, *of: Any) -> int:
+        return hashed(seed, 0) if len(of) == 1 else hashed(seed, *of)
+
+    session.hash_integer = first  # type: ignore[attr-defined]
+
+
+@plant
+def reference_previous() -> None:
+    """A reference trial is compared with the one before it, so that a slow drift passes."""
+    look = watches.ReferenceWatch.look
+
+    def looking(self: watches.ReferenceWatch, trial: Any) -> None:
+        look(self, trial)
+        if self._first is not None and trial.role == "reference":
+            assert self._gate is not None
+            recording = self._campaign.recording(trial.id)
+            self._first = trial.id, references.reference_figures(recording, self._gate)
+
+    watches.ReferenceWatch.look = looking  # type: ignore[method-assign]
+
+
+@plant
+def warm_once() -> None:
+    """After a pause, or with another skin, the skin is not warmed up again."""
+
+    def fresh(self: session.TrialCollector) -> None:
+        self._previous, self._zero_slot = None, None
+
+    session.TrialCollector.fresh_start = fresh  # type: ignore[method-assign]
+
+
+@plant
+def zeroed_once() -> None:
+    """The force sensor is zeroed before the first trial of a session only."""
+    zero = rig.Rig._zero_forces
+
+    def once(self: rig.Rig) -> None:
+        if not self._zeroed:
+            zero(self)
+        elif self.force is not None:
+            self._end_watch()
+            if self._often:
+                self._watch_forces()
+
+    rig.Rig._zero_forces = once  # type: ignore[method-assign]
+
+
+@plant
+def status_by_name() -> None:
+    """A trial that the status has seen counts from then on, whatever happens to its folder."""
+    folders, known = status.StatusReader._folders, dict[str, Any]()
+
+    def seen(self: status.StatusReader, campaign: store.Campaign) -> Any:
+        known.update(folders(self, campaign))
+        there = {path.name for path in campaign.folders("trials")}
+        return {name: each for name, each in known.items() if name in there}
+
+    status.StatusReader._folders = seen  # type: ignore[method-assign]
+
+
+@plant
+def never_kills() -> None:
+    """A run that does not stop gets its time to do so anew at each look."""
+    terminate = runs.ServedRuns._terminate
+
+    def patient(self: runs.ServedRuns) -> None:
+        terminate(self)
+        self._stop_by = runs.monotonic() + runs.STOP_LIMIT_S  # type: ignore[attr-defined]
+
+    runs.ServedRuns._terminate = patient  # type: ignore[method-assign]
+
+
+@plant
+def first_day_only() -> None:
+    """Of the days of a schedule only the first one counts."""
+    cron = schedules.cron_of
+    schedules.cron_of = lambda days, begin: cron(days[:1], begin)

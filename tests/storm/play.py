@@ -22,6 +22,7 @@ from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import push
+from sliplab.storage.trials.control import open_requests
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
@@ -154,6 +155,8 @@ class Player:
             import_module("tests.storm.page")  # here, once for all processes
 
         def work() -> None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup lets them be ignored
             host.install()
             try:
                 Process(stage, host, notes).run(step)
@@ -247,6 +250,8 @@ class Player:
         if (self._stage.folder / "one.h5").exists():  # what an import has left, it clears up
             self._step("end import", {"do": "import"})
         store = Store.open(self._stage.store)
+        for request in open_requests(store):
+            raise Wrong("requests are carried out", f"request {request.number} is open")
         for problem in verify(store):
             what = f"{problem.path}: {problem.what}".replace(str(self._stage.folder), "")
             raise Wrong("nothing is damaged", what)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.storage.streams import Chunk, Sink
+from sliplab.storage.streams import Chunk, FrameChunk, PoseChunk, Sink
 from sliplab.storage.trials.checksums import DATA
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import GROUPS, STREAM_GROUP
@@ -23,16 +23,30 @@ _MORE = {"poses": ("xyz",), "wrench": ("force",), "scalar": ("value",)}
 
 
 class Tee:
-    """Passes chunks on to a sink, and keeps count of them."""
+    """Passes chunks on to a sink, and keeps count of them.
+
+    Attributes:
+        columns: rows and checksum of each column. rows: of each kind of stream.
+        poses: places of the arm. frames_lost: numbers that the frame camera left out.
+    """
 
     def __init__(self, sink: Sink) -> None:
         self.inner = sink
         self.columns: dict[str, Column] = defaultdict(lambda: [0, 0])
+        self.rows: Counter[str] = Counter()
+        self.poses: list[npt.NDArray[np.float64]] = [np.empty((0, 3))]
+        self.frames_lost = 0
 
     def add(self, device: str, chunk: Chunk) -> None:
         """Append a chunk."""
         kind = chunk.KIND
+        self.rows[kind.name] += len(chunk)
+        if isinstance(chunk, FrameChunk) and device == "frames" and len(chunk):
+            frames = self.columns["frames/t"][0] + len(chunk)
+            self.frames_lost = int(chunk.number[-1]) + 1 - frames
         group = _OWN.get((device, kind.name), f"{STREAM_GROUP}/{device}")
+        if isinstance(chunk, PoseChunk):
+            self.poses.append(chunk.xyz_mm)
         known = (device, kind.name) in _OWN or kind.name in _MORE
         for part in ("t", *_MORE.get(kind.name, ())) if known else ():
             _add(self.columns[f"{group}/{part}"], getattr(chunk, kind.columns[part].field))

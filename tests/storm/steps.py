@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
@@ -33,13 +34,16 @@ from sliplab.flows.imports import import_data
 from sliplab.flows.log import add_note
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running import stopping
+from sliplab.flows.status import StatusReader
 from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import push as pushed
 from sliplab.protocols import Trial
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.program import ACTING
+from sliplab.protocols.program import ACTING, Move, Position
+from sliplab.rigs.build import build_rig
 from sliplab.rigs.core import force_watch
+from sliplab.rigs.core.guard import GuardError
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.rigs.rig_file import rig_hash
 from sliplab.storage.errors import StoreError
@@ -50,6 +54,7 @@ from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
+from tests.storm.alerts import watch
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
 
@@ -98,13 +103,16 @@ class Stage:
         """Return the request to collect on a rig with these faults."""
         if not faults and "calm" in vars(self):
             return replace(self.calm, most=most, until=until)
+        return make_request(*self.write(faults), self.store, most=most, until=until)
+
+    def write(self, faults: list[dict[str, Any]]) -> list[Path]:
+        """Write the files of the protocol and of a rig with these faults; return their paths."""
         rig = {**self.story["rig"]}
         rig["mock"] = {**rig["mock"], "faults": faults}
         files = {"protocol.yaml": self.story["protocol"], "rig.yaml": rig}
         for name, content in files.items():
             (self.folder / name).write_text(yaml.dump(content, Dumper=yaml.CSafeDumper))
-        paths = (self.folder / name for name in files)
-        return make_request(*paths, self.store, most=most, until=until)
+        return [self.folder / name for name in files]
 
 
 @dataclass(frozen=True)
@@ -204,7 +212,15 @@ def night(process: Process, step: dict[str, Any]) -> None:
         witness.watch(session.supervisor, request.plan)
         session.supervisor.wait = partial(_wait, host)
         session.supervisor.clock = lambda: host.wall_s
-        session.collector.rig.connect()
+        rig = session.collector.rig
+        close = rig.close
+
+        def closing() -> None:
+            close()
+            _rival(process, witness)  # until here the rig is this program's
+
+        rig.close = closing  # type: ignore[method-assign]
+        rig.connect()
         trials = session.trials
         while trials:
             session.collector.take(trials)
@@ -225,7 +241,8 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
         if event["signal"] == "dropped":  # its exception was lost in a destructor
             stopping.request()
         else:
-            os.kill(os.getpid(), getattr(signal, event["signal"]))
+            # to this thread: another one may get a process's signal, and later
+            signal.raise_signal(getattr(signal, event["signal"]))
     elif "clock" in event:
         process.host.wall_s += event["clock"]
     elif "fill" in event:
@@ -234,21 +251,38 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
     elif "suspend" in event:
         witness.suspend(event["suspend"])
     elif "lie" in event:
-        witness.lie.begin(event["lie"], event["seconds"])
+        witness.lie.begin(event["lie"], event["seconds"], event["axis"])
+    elif "look" in event:
+        _look(process, witness)
     elif "rival" in event:
-        try:
-            with store_lock(Store.open(process.stage.store)):
-                witness.wrong("one program at a time", "a second one got the store's lock")
-        except Locked:
-            pass
+        _rival(process, witness)
     else:
         try:
             if "log" in event:
-                witness.skin_logged = _log(process, event["log"]) or witness.skin_logged
+                _log(process, event["log"])
             else:
                 _file_request(process, event)
         except (OSError, StoreError, InputError) as error:
             process.notes.add(refused=type(error).__name__)
+
+
+def _rival(process: Process, witness: Witness) -> None:
+    """Let a second program try to get the store."""
+    try:
+        with store_lock(Store.open(process.stage.store)):
+            witness.wrong("one program at a time", "a second one got the store's lock")
+    except Locked:
+        pass
+
+
+def _look(process: Process, witness: Witness) -> None:
+    """Hold the status in the middle of a night against the disk."""
+    store = Store.open(process.stage.store)
+    found = StatusReader(store).read()
+    says = found.collects, [(one.campaign, one.committed) for one in found.campaigns]
+    there = len([*store.campaign(NAME).folders("trials")])
+    if says[0] != NAME or (NAME, there) not in says[1]:
+        witness.wrong("a status is true", f"says {says} in a night, with {there} trials")
 
 
 def _file_request(process: Process, wanted: dict[str, Any]) -> None:
@@ -290,16 +324,15 @@ def log(process: Process, step: dict[str, Any]) -> None:
         _log(process, step)
 
 
-def _log(process: Process, step: dict[str, Any]) -> bool:
-    """Log a note, or a skin; return whether it is a skin."""
+def _log(process: Process, step: dict[str, Any]) -> None:
+    """Log a note, or a skin."""
     store = Store.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
-        return False
+        return
     add_note(store, text, who="anna", context=context)
-    process.notes.add(logged=text, **(context or {}))
-    return context is not None
+    process.notes.add(logged=text, at_s=process.host.wall_s, **(context or {}))
 
 
 def check(process: Process, step: dict[str, Any]) -> None:
@@ -402,6 +435,7 @@ def carry(process: Process, step: dict[str, Any]) -> None:
 def react(process: Process, step: dict[str, Any]) -> None:
     """Let a detector listen in a trial's motion, at whose alarm a reflex cuts it short."""
     stage = process.stage
+    protocol, rig = stage.write(step["faults"])
     request = stage.request(step["faults"])
     witness = Witness(request.rig, process.host, process.notes, calm=not step["faults"])
     witness.install()
@@ -409,9 +443,9 @@ def react(process: Process, step: dict[str, Any]) -> None:
     process.host.most_s = NIGHT_S
     measured = [each.id for each in request.plan if each.role == "measured"]
     wanted = make_detect_request(
-        stage.folder / "rig.yaml",
+        rig,
         None,
-        protocol=stage.folder / "protocol.yaml",
+        protocol=protocol,
         trial=measured[step["trial"] % len(measured)].rpartition(",r=")[0],
         detector=named_source("rate", step["level"], None),
         reflex=step["reflex"],
@@ -423,6 +457,34 @@ def react(process: Process, step: dict[str, Any]) -> None:
     process.notes.add(reflex=reflex["done"], phase=reflex.get("phase"))
     if alarm is not None and alarm["phase"] in ACTING and not reflex["done"]:
         process.notes.add(wrong="an alarm in motion is answered", what=f"at {alarm['phase']}")
+
+
+def probe(process: Process, step: dict[str, Any]) -> None:
+    """Send the arm to places within and beyond the limits: only the former are reached."""
+    file = process.stage.calm.rig
+    limits, at = file.limits, Position(0.0, 0.0, -5.0)
+    witness = Witness(file, process.host, process.notes, calm=True)
+    witness.install()
+    rig = build_rig(file, stopping.requested)
+    try:
+        rig.connect()
+        with rig.safely(at):
+            rig.begin_trial(at, 0)
+            for deeper_mm, farther_mm, angle, share in step["places"]:
+                depth_mm = float(limits.depth) + deeper_mm
+                reach_mm = float(limits.reach) + farther_mm
+                to = Position(reach_mm * math.cos(angle), reach_mm * math.sin(angle), depth_mm)
+                allowed = deeper_mm < 0 and farther_mm < 0 and 0 < share <= 1
+                try:
+                    rig.move(Move("probe", to, share * float(limits.speed)), at)
+                except GuardError:
+                    reached = False
+                else:
+                    reached, at = True, to
+                if reached != allowed:
+                    witness.wrong("within limits", f"{deeper_mm, farther_mm, share}: {reached}")
+    finally:
+        rig.close()
 
 
 def _remote(process: Process, step: dict[str, Any]) -> Remote:
@@ -483,6 +545,13 @@ def serve(process: Process, step: dict[str, Any]) -> None:
         serve(process.stage.store, process.notes, step["seed"], step["lost"])
 
 
+def alert(process: Process, step: dict[str, Any]) -> None:
+    """Tell people what happens to the store."""
+    if Store.exists(process.stage.store):
+        store = Store.open(process.stage.store)
+        watch(store, process.host, process.notes, step["seed"], step["lost"])
+
+
 DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "night": night,
     "ask": ask,
@@ -496,5 +565,7 @@ DO: dict[str, Callable[[Process, dict[str, Any]], None]] = {
     "record": take_down,
     "carry": carry,
     "react": react,
+    "probe": probe,
+    "alert": alert,
 }
 """What each kind of step does."""

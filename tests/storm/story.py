@@ -29,7 +29,10 @@ def _device(rng: random.Random, *but: str) -> dict[str, Any]:
 
 FAULTS: dict[str, Draw] = {
     "arm_protective_stop": lambda rng: {},
-    "arm_off_path": lambda rng: {"mm": rng.choice([0.3, 3, 10]), "seconds": rng.choice([0.3, 2])},
+    "arm_off_path": lambda rng: {
+        "mm": rng.choice([0.3, 0.5, 3, 10]),
+        "seconds": rng.choice([0.3, 2]),
+    },
     "frames_lost": lambda rng: {"count": rng.choice([1, 5])},
     "frame_late": lambda rng: {"seconds": rng.choice([0.05, 0.5])},
     "event_gap": lambda rng: {"seconds": rng.choice([0.02, 0.3])},
@@ -58,16 +61,24 @@ FAULTS: dict[str, Draw] = {
     "stream_gone": lambda rng: {"stream": "warm"},
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
+COMMIT = ("=1/record.json", "=1/checksums.json", "=1/.cause.json", "/trials", "/trials")
 NAMES = (
-    *("=1/data.h5", "=1/provenance.json", "=1/record.json", "=1/journal.jsonl"),
-    *("=1/checksums.json", "=1/checksums.json", "=1/.cause.json", "/trials", "/trials"),
+    *("=1/data.h5", "=1/provenance.json", "=1/journal.jsonl", "/skipped.json", "/control"),
     *("/incoming", "/quarantine", "/campaign.json", "/bench", "/store.json", "/rig.yaml"),
-    *("/skipped.json", "/control", ".done.json", "/log", "/objects", "/remote/", "/pulled/"),
+    *(".done.json", "/log", "/objects", "/remote/", "/pulled/"),
 )
-"""Parts of paths, each of which a kill or a power cut may wait for."""
+"""Parts of paths, each of which a kill or a power cut may wait for: of a commit, and others."""
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
+SHARP = (
+    *("arm_protective_stop", "arm_off_path", "frames_lost", "frame_late", "event_gap"),
+    *("event_stall", "clock_drift", "clock_jump", "clock_restart", "pulses_lost"),
+    *("pulses_duplicated", "pulses_late", "disk_full", "device_gone", "stream_gone"),
+)
+"""Kinds that a gate or a watch is there for; they are drawn more often."""
+OF_ANY = {"clock_drift", "clock_jump", "device_gone"}
+"""Kinds that a force sensor has, too."""
 ALONE = {"mains_light", "arm_ramp"}
 """Kinds of which a trial has one at most."""
 
@@ -82,7 +93,7 @@ def draw(seed: int) -> Story:
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [*STEPS]
     steps: list[Step] = []
-    for number in range(rng.randint(8, 16)):
+    for number in range(rng.randint(8, 14)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         last = steps[-1] if steps else {}
         ended = last.get("weather", {}).keys() & {"kill", "power"}
@@ -96,7 +107,7 @@ def draw(seed: int) -> Story:
 
 
 def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
-    data = protocol(rng.randint(3, 6))
+    data = protocol(rng.randint(4, 9))
     data["name"] = "storm"
     collection = data["collection"]
     collection["seed"] = rng.randrange(10_000)
@@ -107,13 +118,13 @@ def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
     settle_s = rng.choice([0.2, 10])
     collection["motion"][2] |= {"settle": f"{settle_s} s", "duration": f"{hold_s} s"}
     collection["limits"] = {**collection.get("limits", {}), "duration": "300 s"}
-    collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0036 ms"])
-    collection["gates"]["retakes"] = rng.choice([0, 2])
+    collection["gates"]["sync_uncertainty"]["digital_input"] = rng.choice(["3 ms", "0.0016 ms"])
+    collection["gates"]["retakes"] = rng.choice([0, 2, 3])
     warm_up = {"presses": 2, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
     rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
     both = {"warm_up": warm_up, "rezero": rezero}
     collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
-    if rng.random() < 0.3:
+    if rng.random() < 0.4:
         condition = {name: factors[name]["values"][0] for name in ("depth", "speed", "direction")}
         collection["references"] = {"every": 2, "condition": condition}
         collection["gates"]["reference"] = {"event_rate": rng.choice(["20 %", "60 %"])}
@@ -129,11 +140,17 @@ def _rig(rng: random.Random) -> dict[str, Any]:
         # close around the motion, so that leaving the path is leaving the limits
         "limits": {"depth": "3.4 mm", "speed": "50 mm/s", "reach": "9 mm"},
     }
+    rig["timing"] = {"code": rng.choice(["lfsr", "lfsr", "irregular", "regular"])}
     if rng.random() < 0.3:
+        grades = ["exposure line", "device time stamps", "host arrival"]
+        rig["timing"]["frames"] = rng.choice(grades)
+    if rng.random() < 0.15:
+        rig["timing"]["arm"] = "host time"
+    if rng.random() < 0.4:
         delay = {"shortest_us": 0, "longest_us": 4000}
-        rig["timing"] = {"force": {"grade": "host time", "delay": delay}}
+        rig["timing"]["force"] = {"grade": "host time", "delay": delay}
         rig["mock"]["force"] = {"rate_hz": 500}
-        if rng.random() < 0.5:
+        if rng.random() < 0.6:
             rig["limits"]["force"] = "12 N"
     if rng.random() < 0.3:
         thermometer = {"kind": "scalar", "unit": "degC", "mock": {"rate_hz": 20}}
@@ -153,18 +170,23 @@ def _trial_s(story: Story) -> float:
 # -- steps ---------------------------------------------------------------------------------------
 
 
-def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
-    """Draw none to three faults of a night."""
+def _faults(rng: random.Random, story: Story, trials: int = 4) -> list[dict[str, Any]]:
+    """Draw none to three faults of a night that takes so many trials."""
     found: list[dict[str, Any]] = []
     for _ in range(rng.choice([0, 0, 1, 1, 2, 3])):
-        kind = rng.choice([*FAULTS])
+        kind = rng.choice([*FAULTS, *SHARP, *SHARP])
         if kind in ALONE and any(fault["kind"] == kind for fault in found):
             continue
+        wired = story["rig"]["timing"].get("arm") != "host time"
         if kind == "stream_gone" and "streams" not in story["rig"]:
             continue
         fault = {"kind": kind, **FAULTS[kind](rng)}
+        if not wired and kind.startswith("pulses") and fault["device"] == "arm":
+            continue
+        if "force" in story["rig"]["mock"] and kind in OF_ANY and rng.random() < 0.3:
+            fault["device"] = "force_sensor"
         if rng.random() < 0.8:
-            fault["trial"] = rng.randint(1, 6)
+            fault["trial"] = rng.randint(1, trials + 2)  # a touch counts as one
         if kind not in WHOLE_TRIALS:
             fault["at_s"] = round(rng.uniform(0, rng.choice([4, _trial_s(story)])), 2)
         if kind not in WHOLE_TRIALS and rng.random() < 0.3:
@@ -173,14 +195,15 @@ def _faults(rng: random.Random, story: Story) -> list[dict[str, Any]]:
     return found
 
 
-def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
+def _weather(rng: random.Random, share: float = 0.45) -> dict[str, Any]:
     if rng.random() > share:
         return {}
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
     if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
-        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": rng.choice(NAMES)}
+        name = rng.choice(rng.choice([COMMIT, NAMES]))
+        kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": name}
         cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
     drawn: list[Step] = [
@@ -196,7 +219,8 @@ def _weather(rng: random.Random, share: float = 0.6) -> dict[str, Any]:
 
 def _ask(rng: random.Random, story: Story, trials: int) -> Step:
     """Draw what an operator asks for."""
-    made: Step = {"ask": rng.choice(["pause", "resume", "stop", "skip", "again", "again"])}
+    kinds = ["pause", "pause", "resume", "stop", "skip", "again", "again"]
+    made: Step = {"ask": rng.choice(kinds)}
     if made["ask"] in {"skip", "again"}:
         made["trials"] = [rng.randrange(trials)]
     return made
@@ -211,31 +235,33 @@ def _event(rng: random.Random, story: Story, trials: int, night_s: float) -> Ste
         {"log": {}},
         {"clock": rng.choice([-7200, -3, 40, 90_000])},
         {"rival": True},
+        {"look": True},
         {"suspend": rng.choice([0.3, 5.0, 600.0])},
         {"fill": rng.choice([0, RESERVE + 2000, RESERVE + 20_000])},
         _lie(rng, story),
     ]
-    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 4])[0]
+    made = rng.choices(drawn, [4, 2, 3, 1, 1, 1, 1, 1, 1, 7])[0]
     return {"at_s": round(rng.uniform(0, 1.1 * night_s), 2), **made}
 
 
 def _lie(rng: random.Random, story: Story) -> Step:
     limited = "force" in story["rig"]["limits"]
     kinds = (*OF_ARM, *OF_FORCE, *OF_FORCE) if limited else OF_ARM
-    return {"lie": rng.choice(kinds), "seconds": rng.choice([1.5, 20.0, 1e9])}
+    lie = {"lie": rng.choice(kinds), "axis": rng.randrange(6)}
+    return {**lie, "seconds": rng.choice([1.5, 20.0, 1e9])}
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
-    most = rng.choice([None, None, None, 1, 2])  # so that later nights have trials left
+    most = rng.choice([None, 1, 2, 2, 3])  # so that later nights have trials left
     night_s = (most or trials) * _trial_s(story)
-    events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3]))]
+    events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3, 4]))]
     for event in [each for each in events if each.get("ask") == "pause"]:
-        if rng.random() < 0.6:  # who pauses goes on again, mostly
+        if rng.random() < 0.8:  # who pauses goes on again, mostly
             end_s = round(event["at_s"] + rng.uniform(0, 3 * night_s), 2)
             events.append({"at_s": end_s, "ask": "resume"})
     window = {"window_s": round(rng.uniform(0, 1.2 * night_s), 1)} if rng.random() < 0.15 else {}
     return {
-        "faults": _faults(rng, story),
+        "faults": _faults(rng, story, most or trials),
         "events": sorted(events, key=lambda event: event["at_s"]),
         "most": most,
         **window,
@@ -276,30 +302,47 @@ def _between(rng: random.Random, story: Story, trials: int) -> Step:
     return {**_ask(rng, story, trials), **_weather(rng, 0.2)}
 
 
+def _probe(rng: random.Random, story: Story, trials: int) -> Step:
+    # with a force limit, what is deep is beyond it
+    deep = [-5.0] if "force" in story["rig"]["limits"] else [-5.0, -1.0, -0.1]
+    places = [
+        [
+            rng.choice([*deep, *deep, 0.1, 2.0]),
+            rng.choice([-8.0, -1.0, -0.1, 0.1, 2.0]),
+            round(rng.uniform(0, 6.28), 2),
+            rng.choice([0.2, 0.99, 0.99, 1.01, 2.0, 0.0]),
+        ]
+        for _ in range(12)
+    ]
+    return {"places": places}
+
+
 def _serve(rng: random.Random, story: Story, trials: int) -> Step:
     return {"seed": rng.randrange(10_000), "lost": rng.choice([0.0, 0.1, 0.4])}
 
 
 STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
-    "night": (4, _night),
+    "night": (12, _night),
     "ask": (2, _between),
     "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
     "verify": (0.5, lambda rng, story, trials: {"quarantine": rng.random() < 0.5}),
     "damage": (1, _damage),
     "import": (0.5, lambda rng, story, trials: _weather(rng)),
-    "push": (2, _copy),
-    "pull": (2, _copy),
+    "push": (1.5, _copy),
+    "pull": (1.5, _copy),
     "serve": (1, _serve),
     "record": (0.4, _record),
     "carry": (0.4, _carry),
     "react": (0.3, _react),
+    "probe": (0.6, _probe),
+    "alert": (0.4, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 FOLLOWS = {
-    "night": ("night", "verify", "damage", "damage", "push", "ask"),
-    "push": ("pull", "pull", "push", "damage"),
-    "pull": ("pull", "push", "damage"),
-    "damage": ("verify", "night", "push", "pull"),
+    "night": ("night", "night", "verify", "damage", "push", "ask"),
+    "push": ("pull", "pull", "push", "damage", "night", "night"),
+    "pull": ("pull", "push", "damage", "night"),
+    "damage": ("verify", "night", "night", "push", "pull"),
 }
 """What often follows a step that ended in a kill or a power cut, or changed what others read."""
 

@@ -40,7 +40,7 @@ def test_every_kind_of_step_is_drawn() -> None:
 
 
 def test_no_invariant_is_broken_and_a_seed_is_one_story_with_one_trace() -> None:
-    both, second = storm("--seed=1", "--stories=2"), storm("--seed=2", "--stories=1")
+    both, second = storm("--seed=40", "--stories=2"), storm("--seed=41", "--stories=1")
     assert both["failed"] == second["failed"] == []
     assert both["hashes"].items() > second["hashes"].items()
 

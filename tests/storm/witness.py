@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,14 +16,21 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import ArmState, Segment
+from sliplab.rigs.core.guard import MEASURED_MM
 from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.arm import MockArm
+from sliplab.rigs.mock.event_camera import MockEventCamera
+from sliplab.rigs.mock.force import MockForceSensor
+from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.sync import MockSyncBox
+from sliplab.rigs.mock.thermometer import MockThermometer
 from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials import control
-from tests.storm.lies import Lie
+from sliplab.storage.trials.context import SKIN, LoggedContext
+from tests.storm.lies import FALSE_PLACES, Lie
 from tests.storm.sent import Tee
 from tests.storm.virtual import Host, Notes
 
@@ -43,6 +52,19 @@ WAIT_S = 0.05
 """By how much a wait may be longer or shorter than planned."""
 PLACE_MM = 0.3
 """How far a step may end from where it was to, where nothing disturbs it."""
+ENDS_MM = 1.5
+"""How far from its end an arm may be that is said to have ended its path, with its motion since."""
+BLIND_MM = 1.5
+"""Motion in contact with unchanged readings until a force sensor is not believed any more."""
+READS = {
+    MockArm: ("read_poses", "read_pulses"),
+    MockEventCamera: ("read", "read_pulses"),
+    MockFrameCamera: ("read", "read_clock"),
+    MockSyncBox: ("read_pulses", "read_clock"),
+    MockForceSensor: ("read",),
+    MockThermometer: ("read",),
+}
+"""Calls by which devices hand over their data."""
 
 
 class Witness:
@@ -53,7 +75,8 @@ class Witness:
         calm: no fault of a device disturbs where the arm is.
 
     Attributes:
-        resumed: a pause has ended, or another skin was logged, and depth zero not found since.
+        resumed: a session has begun, a pause ended, or another skin was logged, and depth zero was
+            not found since.
         lie: what a device reports that is not so.
     """
 
@@ -75,8 +98,16 @@ class Witness:
         self._asked_s: float | None = None
         self._starts = 0
         self._outside: tuple[float, float] | None = None
-        self.resumed = self.skin_logged = False
-        self._rezeroes = False
+        self._began_over = 0.0
+        self._handed: Counter[str] | None = None
+        self._zeroed = False
+        self._corners: list[Any] = []
+        self._blind: tuple[Any, float] | None = None
+        self.resumed = True
+        self._skin: str | None = None
+        self._plan: Plan | None = None
+        self._slot: int | None = None
+        self._pressed = 0
 
     def wrong(self, invariant: str, what: str) -> None:
         """Note a fault."""
@@ -95,7 +126,7 @@ class Witness:
         self._pass_time(self._world, round(seconds * 1e9))
         late_s = self._host.passed_s - began_s  # which no program can make up for
         self._asked_s = None if self._asked_s is None else self._asked_s + late_s
-        self._lied_s = self._outside = self._forced_s = None
+        self._lied_s = self._outside = self._forced_s = self._blind = None
 
     def watch_reflexes(self) -> None:
         """Hold each reflex against where the arm truly is."""
@@ -128,18 +159,40 @@ class Witness:
         take_step: Any = Rig.take_step
         start_streams: Any = Rig.start_streams
         stop_streams: Any = Rig.stop_streams
+        press: Any = Rig.press
+        retract: Any = Rig._retract
+        zero = MockForceSensor.zero
         self.lie.install()
+        self._count_reads()
         self._pass_time = pass_time
 
         def starting(arm: MockArm, path: Sequence[Segment]) -> None:
             self._look_at_path(arm._world, path)
             state = arm._world.arm_state
+            self._corners.append(arm._world.path.states(_now(arm._world))[0][:3])
             start(arm, path)
+            self._corners += [np.array(segment.to.xyz_mm) for segment in path]
             if state is ArmState.PROTECTIVE_STOP:
                 self.wrong("no motion after a stop", f"it is sent on in {state.value}")
-            self._segment, self._lied_s = path[-1], None
+            self._segment, self._lied_s, self._blind = path[-1], None, None
             # what is sent from a false pose goes to a false place, which nothing here can know
-            self._misled = self.lie.active in {"pose_away", "pose_frozen"}
+            self._misled = self._is_false
+
+        def zeroing(sensor: MockForceSensor) -> None:
+            zero(sensor)
+            self._zeroed = True
+            deep_mm = float(_place(sensor._world)[2])
+            if self._calm and not deep_mm < 0:
+                self.wrong("forces are zeroed clear of the plate", f"{deep_mm:.2f} mm deep")
+
+        def retracting(rig: Rig, *given: Any) -> Any:
+            if self._asked_s is None:  # it is sent once, and straight, whatever made it stop
+                self._asked_s, self._starts = self._host.passed_s, 0
+            return retract(rig, *given)
+
+        def pressing(rig: Rig, *given: Any) -> None:
+            press(rig, *given)
+            self._pressed += 1
 
         def passing(world: SimulatedWorld, ns: int) -> None:
             self._world = world
@@ -147,7 +200,7 @@ class Witness:
             self._look(world)
 
         def rezeroing(rig: Rig, *given: Any) -> Any:
-            self.resumed = False
+            self.resumed, self._slot = False, None
             found = rezero(rig, *given)
             self._look_at_zero(rig)
             return found
@@ -160,26 +213,51 @@ class Witness:
 
         def starting_streams(rig: Rig, *given: Any, **named: Any) -> None:
             start_streams(rig, *given, **named)
-            self._streams_s = self._host.passed_s
+            self._streams_s, self._handed = self._host.passed_s, Counter()
+            if rig.force is not None and rig.force.zeroing == "trial" and not self._zeroed:
+                self.wrong("forces are zeroed clear of the plate", "not before this trial")
+            self._zeroed = False
 
         def stopping_streams(rig: Rig, sink: Any) -> None:
             took_s = self._host.passed_s - self._streams_s
             stop_streams(rig, sink)
+            handed, self._handed = self._handed, None
+            for kind, rows in (handed or {}).items() if isinstance(sink, Tee) else ():
+                if rows != sink.rows[kind]:
+                    what = f"{rows} rows of {kind}, stored are {sink.rows[kind]}"
+                    self.wrong("what is handed over is stored", what)
             for name, rate_hz in RATES_HZ.items() if isinstance(sink, Tee) and self._calm else ():
+                if name == "frames/t" and rig.timing.frames != "hardware trigger":
+                    continue  # it runs by itself
                 rows = sink.columns[name][0]
                 if not rows >= rate_hz * took_s - 2:
                     self.wrong("what happened is recorded", f"{rows} rows of {name} in {took_s} s")
 
         def running(rig: Rig, program: Any, sink: Any, *more: Any, **named: Any) -> Any:
-            if self.resumed and self._rezeroes:
-                self.wrong("pauses and skins change the rig", "depth zero is not found again")
+            maintenance = None if self._plan is None else self._plan.protocol.collection.maintenance
+            if maintenance and maintenance.rezero and (self.resumed or self._slot is not None):
+                self.wrong("a rig is prepared", "depth zero is not found again")
+            if maintenance and maintenance.warm_up and not self._pressed:
+                self.wrong("a rig is prepared", "the skin is not warmed up")
             self.resumed = False
-            tee = Tee(sink)
+            tee, began_s = Tee(sink), self._host.wall_s
+            self._corners.clear()
             done = run_trial(rig, program, tee, *more, **named)
-            self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name, sent=tee.columns)
+            about = {
+                "sent": tee.columns,
+                "lost": tee.frames_lost,
+                "strayed_mm": _strayed_mm(np.concatenate(tee.poses), np.array(self._corners)),
+                "times": [began_s, self._host.wall_s],
+                "zero_mm": rig.plate_frame.zero_mm,
+                "phases": [[step.phase, step.recorded] for step in program.steps],
+            }
+            self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name, **about)
             return done
 
         MockArm.start = starting  # type: ignore[method-assign]
+        MockForceSensor.zero = zeroing  # type: ignore[method-assign]
+        Rig.press = pressing  # type: ignore[method-assign]
+        Rig._retract = retracting  # type: ignore[method-assign]
         SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
         Rig.run_trial = running  # type: ignore[method-assign]
         Rig.rezero = rezeroing  # type: ignore[method-assign]
@@ -187,10 +265,28 @@ class Witness:
         Rig.stop_streams = stopping_streams  # type: ignore[method-assign]
         Rig.take_step = stepping  # type: ignore[method-assign]
 
+    def _count_reads(self) -> None:
+        """Count the rows that devices hand over while their streams are recorded, by kind."""
+
+        def counting(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
+            def reading(device: Any) -> Any:
+                chunk = read(device)
+                if self._handed is not None:
+                    self._handed[chunk.KIND.name] += len(chunk)
+                return chunk
+
+            return reading
+
+        for kind, names in READS.items():
+            for name in names:
+                setattr(kind, name, counting(getattr(kind, name)))
+
     def watch(self, supervisor: CollectionSupervisor, plan: Plan) -> None:
         """Watch what a collection is allowed between its trials."""
-        self._rezeroes = plan.protocol.collection.maintenance.rezero is not None
-        may_take = supervisor.may_take
+        self._plan = plan
+        rezeroes = plan.protocol.collection.maintenance.rezero is not None
+        may_take, slots = supervisor.may_take, list[int]()
+        places = [each.id for each in plan]
 
         store, campaign = supervisor._store, supervisor._campaign
         until = supervisor._run_request.until
@@ -200,15 +296,19 @@ class Witness:
             may = may_take(trial)
             if not may:
                 return may
-            self._notes.add(begins=trial.id)
+            self._notes.add(begins=trial.id, place=places.index(trial.id))
             if (pause := control.paused(store)) is not None:
                 self.wrong("requests are carried out", f"continues in spite of a {pause.kind}")
             if trial.id in control.skipped(campaign):
                 self.wrong("requests are carried out", f"takes {trial.id}, which is skipped")
             if any(each.kind == "stop" and each.number > last for each in control.requests(store)):
                 self.wrong("requests are carried out", "continues in spite of a stop")
-            if self.skin_logged:
-                self.resumed, self.skin_logged = True, False
+            skin = LoggedContext(store, campaign.name).read().get(SKIN)
+            if self.resumed or skin != self._skin:
+                self.resumed, self._skin, self._pressed = True, skin, 0
+            if rezeroes and (slot := plan.rezero_task(trial).slot) not in slots[-1:]:
+                slots.append(slot)
+                self._slot = slot  # until depth zero is found for it
             if until is not None and self._host.wall_s > until:
                 self.wrong("no trial begins outside its window", trial.id)
             folders = campaign.folders("trials")
@@ -237,31 +337,44 @@ class Witness:
                 self.wrong("a trial is as planned", f"waits {took_s:.2f} s, not {step.seconds:.2f}")
             return
         world = _world(rig)
-        true = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
+        true = _place(world)
         wanted = world.plane.sensor(rig.plate_frame.pose(step.to))
         if not math.dist(true[:3], wanted[:3]) <= PLACE_MM:
             off = math.dist(true[:3], wanted[:3])
             self.wrong("a trial is as planned", f"{step.phase} ends {off:.2f} mm off")
         planned_s = at.distance_mm(step.to) / step.speed_mm_s
-        if not took_s >= 0.95 * planned_s - WAIT_S:
+        if not 0.95 * planned_s - WAIT_S <= took_s <= 1.05 * planned_s + WAIT_S:
             self.wrong("a trial is as planned", f"{step.phase} takes {took_s:.2f} s of {planned_s}")
 
     def _look_at_path(self, world: SimulatedWorld, path: Sequence[Segment]) -> None:
-        here = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
+        here = _place(world)
+        self._began_over = self._excess(here) + MEASURED_MM
+        before = self._segment
+        if before is not None and world.path.moving(world.now_ns):
+            off_mm = math.dist(here, world.plane.sensor(before.to)[:3])
+            if not off_mm <= ENDS_MM:
+                what = f"it is sent on {off_mm:.2f} mm before the end of its path"
+                self.wrong("a path begins where the last one ended", what)
         for segment in path:
             there = world.plane.sensor(segment.to)
             if self._asked_s is not None:
                 self._starts += 1
-                aside = math.dist(here[:2], there[:2])
-                if self._starts > 1 or aside > 0.5 or there[2] > here[2] + 0.01:
+                aside, deeper = math.dist(here[:2], there[:2]), there[2] - here[2]
+                astray = not (aside <= 0.5 and deeper <= 0.01) and not self._is_false
+                if self._starts > 1 or astray:
                     self.wrong(
                         "no motion after a stop",
                         f"move {self._starts} goes {aside:.2f} mm aside to {there[2]:.2f} mm deep",
                     )
             if not 0 < segment.speed_mm_s <= self._speed_mm_s + 1e-6:
                 self.wrong("within limits", f"is sent at {segment.speed_mm_s} mm/s")
-            if self.lie.active not in {"pose_away", "pose_frozen"}:
+            if not self._is_false:
                 self._check_place(there, here, "is sent")
+
+    @property
+    def _is_false(self) -> bool:
+        """Whether the arm reports to be elsewhere, so that what is sent from there goes astray."""
+        return self.lie.active in FALSE_PLACES
 
     def _excess(self, place: Any) -> float:
         """Return how far a place on the true plate is beyond the limits, mm."""
@@ -275,9 +388,14 @@ class Witness:
     def _look_at_lie(self, now_s: float, moving: bool, place: Any, world: SimulatedWorld) -> None:
         """A device that reports what cannot be stops the arm."""
         kind, segment = self.lie.active, self._segment
-        if not (kind and moving and segment) or (kind == "pose_away" and self._misled):
+        if kind == "path_done" or not (kind and moving and segment):
             self._lied_s = None
             return
+        if kind in {"pose_away", "pose_creep"}:
+            shown = self.lie.pose and world.plane.sensor(self.lie.pose)
+            if self._misled or shown is None or not self._excess(shown) > PLATE_MM + ENDS_MM:
+                self._lied_s = None
+                return
         if self._lied_s is None or kind != self._lied:
             self._lied, self._lied_s = kind, now_s
         bound_s = self._poll_s + SLACK_S
@@ -292,8 +410,21 @@ class Witness:
             if straight and there[2] < place[2]:
                 return  # it leaves the plate, whatever the sensor says
             bound_s = SILENT_S
+            if kind == "force_frozen" and not self._is_blind(place):
+                self._lied_s = now_s
+                return
         if now_s - self._lied_s > bound_s:
             self.wrong("no news and no number are a fault", f"moves on in spite of {kind}")
+
+    def _is_blind(self, place: Any) -> bool:
+        """Return whether the arm moved so far in contact that a force had to change."""
+        begin, gone_mm = self._blind or (place, 0.0)
+        if place[2] <= ZERO_MM or place[2] < begin[2] - 0.005:
+            self._blind = None  # where contact ends, forces may stay as they are
+            return False
+        gone_mm = max(gone_mm, math.dist(begin, place))
+        self._blind = begin, gone_mm
+        return gone_mm > BLIND_MM
 
     def _look_at_force(self, now_s: float, moving: bool, place: Any, world: SimulatedWorld) -> None:
         """A force beyond the limit stops the arm, unless it leaves the plate."""
@@ -313,7 +444,7 @@ class Witness:
     def _look(self, world: SimulatedWorld) -> None:
         """Look at the arm where it truly is now."""
         now_s, moving = self._host.passed_s, world.path.moving(world.now_ns)
-        place = world.path.states(np.array([world.now_ns], np.int64))[0][6:9]
+        place = _place(world)
         self._look_at_lie(now_s, moving, place, world)
         self._look_at_force(now_s, moving, place, world)
         if self._asked_s is not None and moving and self._starts == 0:
@@ -321,7 +452,8 @@ class Witness:
             if late > self._poll_s + 1e-3:
                 self.wrong("stops in time", f"still moves {late:.3f} s after it was asked to stop")
         over = self._excess(place)
-        if not (moving and over > PLATE_MM) or self._misled:
+        # a path that begins outside leads back, and may go as far again on its way
+        if not (moving and over > max(PLATE_MM, self._began_over)) or self._misled:
             self._outside = None
         elif self._outside is None or over <= self._outside[1]:  # it may come back
             self._outside = now_s, over
@@ -332,3 +464,23 @@ class Witness:
 def _world(rig: Rig) -> SimulatedWorld:
     assert isinstance(rig.arm, MockArm)
     return rig.arm._world
+
+
+def _now(world: SimulatedWorld) -> Any:
+    return np.array([world.now_ns], np.int64)
+
+
+def _place(world: SimulatedWorld) -> Any:
+    """Return where the sensor truly is on the true plate, x, y and depth, mm."""
+    return world.path.states(_now(world))[0][6:9]
+
+
+def _strayed_mm(places: Any, corners: Any) -> float:
+    """Return the largest distance of places (n, 3) from the lines between corners (m, 3)."""
+    nearest = np.full(len(places), np.inf)
+    for begin, end in pairwise(corners):
+        way = end - begin
+        share = np.clip((places - begin) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        away = np.linalg.norm(places - begin - share[:, None] * way, axis=1)
+        nearest = np.minimum(nearest, away)
+    return float(nearest.max(initial=0.0))

@@ -7,6 +7,7 @@ import pytest
 
 from sliplab.analysis.labels.plate_tracking import track_video
 from sliplab.rigs.core.capabilities import Segment
+from sliplab.rigs.mock import physics
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
@@ -167,3 +168,16 @@ def test_the_noise_of_tracks_is_that_of_tracking_the_video() -> None:
     marker = found.plate.xy - view.marker.centre_px(plate)
     assert np.sqrt(np.mean(papilla**2)) == pytest.approx(settings.centroid_noise_px, rel=0.3)
     assert np.sqrt(np.mean(marker**2)) == pytest.approx(settings.plate_noise_px, rel=0.3)
+
+
+def test_frames_that_are_read_too_late_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(physics, "KEPT_NS", 1_000_000_000)
+    devices = rig(level="tracks")
+    devices.frames.set_region(SIZE, SIZE)
+    devices.frames.start()
+    devices.sync.start(100.0, 4321)
+    devices.clock.wait(5.0)
+    number = devices.frames.read().number
+    assert number[0] > 0
+    assert number[-1] > 490
+    assert (np.diff(number) == 1).all()
