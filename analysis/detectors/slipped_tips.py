@@ -66,7 +66,8 @@ def _centres(cell: npt.NDArray[np.complex128], number: I64) -> npt.NDArray[np.co
     """Return the mean cell of each number; columns are real, rows imaginary."""
     centres = np.zeros(number.max() + 1, np.complex128)
     np.add.at(centres, number, cell)
-    return centres / np.bincount(number)
+    centres /= np.bincount(number)
+    return centres
 
 
 class SlippedTips:

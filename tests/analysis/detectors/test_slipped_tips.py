@@ -66,7 +66,7 @@ def test_cells_belong_to_the_nearest_tip_and_parts_of_an_edge_are_one() -> None:
     assert found[11, 9] == found[10, 8] == found[12, 10] == 0
     assert found[11, 23] == found[14, 23] == 1
     assert found[11, 16] == found[25, 9] == -1  # beyond the reach
-    with pytest.raises(ValueError, match="empty"):
+    with pytest.raises(ValueError, match="zero-size"):
         regions(np.full(1200, -1), 40)
 
 
