@@ -49,7 +49,7 @@ def test_answer_that_comes_late_is_not_taken_for_the_next_one(
         loopback.at_rest()
 
 
-@pytest.mark.parametrize(("pid", "limit_s"), [(0, 0.3), (os.getpid(), 1e-3)])
+@pytest.mark.parametrize(("pid", "limit_s"), [(0, 0.3), (os.getpid(), 1e-3)], ids=["idle", "work"])
 def test_fakes_that_idle_or_work_for_too_long_do_not_start(
     monkeypatch: pytest.MonkeyPatch, pid: int, limit_s: float
 ) -> None:
