@@ -15,6 +15,8 @@ from sliplab.storage.streams import F64
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
+pytestmark = pytest.mark.realtime  # a process that waits for a core pushes too late to be bounded
+
 APART_NS = 77_000_000_000
 """What the glove's clock is behind the host's."""
 
