@@ -89,13 +89,28 @@ class _StampedSocket(socket.socket):
     def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:
         """Return the next packet and its sender."""
         data, notes, _, sender = self.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size), flags)
-        self.arrived_ns = time.monotonic_ns()
+        arrived_ns, real_ns = _both_clocks()
         for level, kind, note in notes:
             if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
                 seconds, ns = _TIMESPEC.unpack(note[: _TIMESPEC.size])
-                age_ns = time.time_ns() - (seconds * 1_000_000_000 + ns)
-                self.arrived_ns -= age_ns if 0 <= age_ns < _OLDEST_NS else 0
+                age_ns = real_ns - (seconds * 1_000_000_000 + ns)
+                arrived_ns -= age_ns if 0 <= age_ns < _OLDEST_NS else 0
+        # packets are read in the order of their arrival, whatever became of the real-time clock
+        self.arrived_ns = max(self.arrived_ns, arrived_ns)
         return data, sender
+
+
+def _both_clocks() -> tuple[int, int]:
+    """Return the monotonic and the real-time clock of one moment, ns.
+
+    Of two readings the shorter: between its calls a process may lose its core for milliseconds.
+    """
+    found = []
+    for _ in range(2):
+        here_ns, real_ns = time.monotonic_ns(), time.time_ns()
+        found.append((time.monotonic_ns() - here_ns, here_ns, real_ns))
+    _, here_ns, real_ns = min(found)
+    return here_ns, real_ns
 
 
 class EgmReceiver:

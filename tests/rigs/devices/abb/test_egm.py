@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import socket
+import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.devices.abb import egm
 from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
 from tests.rigs.devices.conftest import egm_message
 from tests.rigs.waiting import own_address
@@ -172,3 +175,32 @@ def test_sequence_numbers_wrap_and_restart(
     for at, number in enumerate(numbers):
         assert take(packet(number, 1.0 + 0.012 * at)) is not None
     assert receiver.counts == EgmCounts(lost=lost)
+
+
+class _Preempted:
+    """The clocks of a process that once loses its core for 50 ms while it reads them."""
+
+    def __init__(self) -> None:
+        self.loses, self._lost_ns = False, 0
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns() + self._lost_ns
+
+    def time_ns(self) -> int:
+        self._lost_ns += 50_000_000 * self.loses
+        self.loses = False
+        return time.time_ns() + self._lost_ns
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps packets")
+def test_arrivals_are_those_of_the_kernel_also_where_a_process_loses_its_core(
+    take: Take, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clocks = _Preempted()
+    monkeypatch.setattr(egm, "time", clocks)
+    first = take(packet(1, 0.1))
+    clocks.loses = True
+    second = take(packet(2, 0.104))
+    assert first is not None
+    assert second is not None
+    assert first.host_ns < second.host_ns
