@@ -37,9 +37,7 @@ class FollowedSlide:
 
 def followed(count: int, worlds: str) -> list[FollowedSlide]:
     """Return some slides of the bench's training worlds."""
-    drawn = [
-        scene for scene in training_scenes(SIZES["full"], worlds)[0] if "hold" not in scene.name
-    ]
+    drawn, _ = training_scenes(SIZES["full"], worlds)
     found = []
     for scene in drawn[:: max(len(drawn) // count, 1)][:count]:
         taken = take(scene)

@@ -103,7 +103,7 @@ READS = StreamKind(
 )
 _ERROR = Column("error_ns", "int64", (), "ns, bound of what else the reading may be off")
 CLOCK = StreamKind("clock", {**READS.columns, "error": _ERROR})
-"""Readings of a recorded stream's clock; it may fall back. """
+"""Readings of a recorded stream's clock; it may fall back."""
 TRIGGERS = StreamKind(
     "triggers",
     {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,8 +32,8 @@ F64 = npt.NDArray[np.float64]
 class AtLevel(StreamDetector):
     """A detector with its level. Evidence above it is gross slip by the detector's own class alone.
 
-    Where the detector knows the share of slipped tips, slip goes on after an alarm for as long as
-    tips slip, and is gross once all of them do. Before an alarm the share is 0.
+    Where the detector knows the share of slipped tips, slip lasts from an alarm until no tip slips,
+    and is gross once all of them do. Before an alarm the share is 0.
 
     The detector is given events in order: those that are older than what it has been given are left
     out, and those at the newest moment wait, as others of that moment may follow.
@@ -60,7 +61,7 @@ class AtLevel(StreamDetector):
         self._from_us = self._settled_us = self._window_us = at_us
         self._held = EventChunk.empty()
         self._events = 0
-        self._slipping = False
+        self._slipping, self._share = False, 0.0
         self._last_us: int | None = None
         try:
             self.detector.begin(*self._size)
@@ -109,10 +110,11 @@ class AtLevel(StreamDetector):
             return label, None
         slipped = found.slipped.copy()
         for k, share in enumerate(slipped.tolist()):
-            if label[k] == NO_SLIP and not share > 0:
-                self._slipping = False
-            elif label[k] != NO_SLIP:
+            if label[k] != NO_SLIP:
                 self._slipping = True
+            elif math.isnan(share) or share == 0 < self._share:  # tips are followed a little later
+                self._slipping = False
+            self._share = share
             if self._slipping and share > 0:
                 label[k] = GROSS if share >= ALL_SLIPPED else INCIPIENT
             elif share > 0:

@@ -27,7 +27,7 @@ LETS_GO_MS = 1000.0
 FIRST = 0.02
 """Probability at first that a tip has let go."""
 FOLLOWED_MS = 100.0
-"""Time in which the rate of a tip that sticks is measured anew: it grows as others let go."""
+"""Time in which the rate of a tip that sticks is measured again: it grows as others let go."""
 REACH_CELLS = 5
 ONE_TIP_CELLS = 4
 """Places with centres nearer than this are of one tip; those of two are about 8 apart."""

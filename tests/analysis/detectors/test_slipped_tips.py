@@ -16,7 +16,7 @@ from sliplab.analysis.detectors.slipped_tips import (
 
 
 def test_the_filter_is_the_forward_recursion() -> None:
-    """Without noise, and while every tip has probably let go, so that no rate is measured anew."""
+    """Without noise, and while every tip has probably let go, so that no rate is measured again."""
     rate = np.array([2.0, 5.0])
     counts = np.random.default_rng(1).poisson(SLID * rate, (40, 2))
     tips = SlippedTips(rate, np.zeros(2))
