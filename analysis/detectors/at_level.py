@@ -24,6 +24,8 @@ from sliplab.storage.streams import EventChunk
 WARM_UP_US = 1_000_000
 ALL_SLIPPED = 0.97
 """Share of the tips from which slip is gross: no tip of 30 sticks."""
+STILL_GROSS = 0.8
+"""Share below which it is incipient again, so that a few doubtful tips do not change it."""
 
 I8 = npt.NDArray[np.int8]
 F64 = npt.NDArray[np.float64]
@@ -61,7 +63,7 @@ class AtLevel(StreamDetector):
         self._from_us = self._settled_us = self._window_us = at_us
         self._held = EventChunk.empty()
         self._events = 0
-        self._slipping, self._share = False, 0.0
+        self._slipping, self._gross, self._share = False, False, 0.0
         self._last_us: int | None = None
         try:
             self.detector.begin(*self._size)
@@ -115,8 +117,9 @@ class AtLevel(StreamDetector):
             elif math.isnan(share) or share == 0 < self._share:  # tips are followed a little later
                 self._slipping = False
             self._share = share
+            self._gross = share >= (STILL_GROSS if self._gross else ALL_SLIPPED)
             if self._slipping and share > 0:
-                label[k] = GROSS if share >= ALL_SLIPPED else INCIPIENT
+                label[k] = GROSS if self._gross else INCIPIENT
             elif share > 0:
                 slipped[k] = 0.0
         return label, slipped
