@@ -155,8 +155,8 @@ def test_slip_goes_on_after_an_alarm_for_as_long_as_tips_slip() -> None:
         0.0,
         0.5,
         0.98,
-        0.92,
-        0.8,
+        0.82,
+        0.7,
     ]
     judged = AtLevel(Tips(value, share), 12.0)
     judged.begin(640, 480)
@@ -179,7 +179,7 @@ def test_slip_goes_on_after_an_alarm_for_as_long_as_tips_slip() -> None:
         0.0,
         0.5,
         0.98,
-        0.92,
-        0.8,
+        0.82,
+        0.7,
     ]
     assert np.array_equal(found.slipped, shown, equal_nan=True)
