@@ -156,6 +156,7 @@ class Papillae(Detector):
         self._place = np.full(cells, -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
         self._cells, self._unloaded = np.zeros(0), False
+        self._hot = np.array(self.settings.hot, np.int64)
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
         self._age = np.zeros(3, np.int64)
         self._tips: SlippedTips | None = None
@@ -165,10 +166,13 @@ class Papillae(Detector):
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `Detector`."""
         events = EventChunk.concatenate([self._held, events]) if len(self._held) else events
-        cells = self._cells_of(events)
-        ms, on = events.t_us // BIN_US, events.p > 0
         first, last = self._done, int(until_us) // BIN_US
         value, slipped = np.zeros(last - first), np.zeros(last - first)
+        if first == last:  # no millisecond ends
+            self._held = events
+            return replace(Evidence.of([], value), slipped=slipped)
+        cells = self._cells_of(events)
+        ms, on = events.t_us // BIN_US, events.p > 0
         at, done = first, 0
         while at < last:
             if at % PLACES_MS == 0:
@@ -226,21 +230,14 @@ class Papillae(Detector):
 
     def _find_places(self, at: int) -> None:
         """Find the places at a millisecond; each takes over the statistics of its cells."""
-        block = at // PLACES_MS
-        if block:
-            # the block that leaves has the place of the next one, and is empty at first
-            self._events += self._blocks[(block - 1) % len(self._blocks)]
-            self._events -= self._blocks[block % len(self._blocks)]
+        if block := at // PLACES_MS:
+            _replace_block(self._events, self._blocks, block)
         self._placed = at
-        total, on = self._events
-        events = total.copy()
-        if self.settings.hot:
-            events[list(self.settings.hot)] = 0
-        found = _places(events, self._shape[1], self._place, self._rest, self._pushed)
-        self._place, self._rest, self._pushed, self._noise, self._cells = found
-        placed = self._placed_cells = np.flatnonzero(self._place >= 0)
-        seen = total[placed].sum()
-        self._unloaded = bool(seen > 0 and 1 - on[placed].sum() / seen >= UNLOADED)
+        found = _places(
+            self._events, self._hot, self._shape[1], self._place, self._rest, self._pushed
+        )
+        self._place, self._placed_cells, self._rest, self._pushed, self._noise, self._cells = found
+        self._unloaded = _share_off(self._events, self._placed_cells) >= UNLOADED
         shape = MEMORY_MS + GAP_MS + PLACES_MS, len(self._noise)
         self._counts, self._back = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
         # single milliseconds only where the memory will begin and end: the sum of the others counts
@@ -333,22 +330,52 @@ class Papillae(Detector):
 
 
 @njit(cache=True, nogil=True)
-def _places(
-    events: I64, columns: int, before: I64, rest: F64, pushed: F64
-) -> tuple[I64, F64, F64, F64, F64]:
-    """Return the place of each cell, -1 for none, and the places' statistics, noise and cells.
+def _replace_block(events: I64, blocks: npt.NDArray[np.uint32], block: int) -> None:
+    """Add the block that ended before `block`, and take away the oldest.
 
     Args:
-        events: of each cell, row by row. before: the cells' former places.
-        rest, pushed: statistics of the former places.
+        events: sums, which are changed. blocks: as of `_keep`. The oldest has the place of the
+            next one, and is empty at first.
     """
+    came, left = blocks[(block - 1) % len(blocks)], blocks[block % len(blocks)]
+    for kind in range(2):
+        for cell in range(events.shape[1]):
+            events[kind, cell] += np.int64(came[kind, cell]) - np.int64(left[kind, cell])
+
+
+@njit(cache=True, nogil=True)
+def _share_off(events: I64, cells: I64) -> float:
+    """Return the share of OFF events in some cells; 0 without events."""
+    seen, on = 0, 0
+    for cell in cells:
+        seen += events[0, cell]
+        on += events[1, cell]
+    return 1 - on / seen if seen else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _places(
+    every: I64, hot: I64, columns: int, before: I64, rest: F64, pushed: F64
+) -> tuple[I64, I64, F64, F64, F64, F64]:
+    """Return the place of each cell, negative for none, and the cells with one.
+
+    Returns the places' statistics, noise and numbers of cells, too.
+
+    Args:
+        every: events, all in the first row, of each cell. hot: cells that do not count.
+        before: the cells' former places. rest, pushed: statistics of the former places.
+    """
+    events = every[0].copy()
+    for cell in hot:
+        events[cell] = 0
     noise = _median(events)
     least = noise + NOISE_DEVIATIONS * math.sqrt(noise) + CELL_EVENTS
     place = np.full(len(events), -1)
     stack, members = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
-    new_rest, new_pushed = np.zeros(len(events)), np.zeros(len(events))
-    new_noise, cells = np.zeros(len(events)), np.zeros(len(events))
-    places = 0
+    placed, n_placed = np.empty(len(events), np.int64), 0
+    most, places = len(events) // PLACE_CELLS, 0
+    new_rest, new_pushed = np.zeros(most), np.zeros(most)
+    new_noise, cells = np.zeros(most), np.zeros(most)
     for start in range(len(events)):
         if events[start] < least or place[start] != -1:
             continue
@@ -371,6 +398,8 @@ def _places(
             continue
         total = 0.0
         for cell in members[:size]:
+            placed[n_placed] = cell
+            n_placed += 1
             total += events[cell]
             if before[cell] >= 0:
                 new_rest[places] += events[cell] * rest[before[cell]]
@@ -379,7 +408,8 @@ def _places(
         new_pushed[places] /= total
         new_noise[places], cells[places] = size * noise / SEEN_MS, size
         places += 1
-    return place, new_rest[:places], new_pushed[:places], new_noise[:places], cells[:places]
+    part = slice(places)
+    return place, placed[:n_placed], new_rest[part], new_pushed[part], new_noise[part], cells[part]
 
 
 @njit(cache=True, nogil=True)
