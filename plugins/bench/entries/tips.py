@@ -116,9 +116,12 @@ class TipNet(nn.Module):
         return self.whole(torch.cat([found.amax(1), mean, whole], 1))[:, 0]
 
 
-def log_odds(net: TipNet, seen: Inputs) -> float:
-    """Return `TipNet.forward` of one millisecond, without the cost of tensors."""
-    w = [one.detach().numpy() for one in net.parameters()]  # four layers, weights and biases
+def log_odds(w: Sequence[F32], seen: Inputs) -> float:
+    """Return `TipNet.forward` of one millisecond, without the cost of tensors.
+
+    Args:
+        w: weights and biases of the layers, in their order.
+    """
     around = np.broadcast_to(seen.whole, (len(seen.places), OF_ALL))
     found = np.concatenate([seen.places, around], axis=1)
     for weight, bias in ((w[0], w[1]), (w[2], w[3])):
@@ -139,7 +142,7 @@ class TipNetwork(Papillae):
     def __init__(self, *, joined: bool = False, seed: int = 0, disturbed: int = 0) -> None:
         super().__init__()
         self._joined, self._seed, self._disturbed = joined, seed, disturbed
-        self._net: TipNet | None = None
+        self._weights: list[F32] | None = None
         self._least = LOWEST
         self._wanted: set[int] = set()
         self._seen: list[tuple[int, Inputs]] = []
@@ -157,9 +160,10 @@ class TipNetwork(Papillae):
         disturbed = [simulated(one) for each in drawn.values() for one in each]
         others = [scene for k, scene in enumerate(disturbed) if k % HELD_OUT]
         rng = np.random.default_rng(self._seed)
-        self._net, self._least = None, LOWEST
+        self._weights, self._least = None, LOWEST
         samples = [one for scene in [*scenes, *others] for one in self._samples(scene, rng)]
-        self._net = fitted(samples, self._seed)
+        net = fitted(samples, self._seed)
+        self._weights = [one.detach().numpy() for one in net.parameters()]
         held_out = disturbed[::HELD_OUT]
         found = [SceneEvidence(feed(self, scene), scene.slip) for scene in held_out]
         self._least = level_at(found, ALLOWED)
@@ -188,14 +192,14 @@ class TipNetwork(Papillae):
         super()._advance(first, value)
         odds = np.full(len(value), LOWEST)
         for k, tested in enumerate(value.tolist()):
-            if self._net is None and first + k not in self._wanted:
+            if self._weights is None and first + k not in self._wanted:
                 continue
             if (seen := self._look(first + k, tested)) is None:
                 continue
-            if self._net is None:
+            if self._weights is None:
                 self._seen.append((first + k, seen))
             else:
-                odds[k] = max(log_odds(self._net, seen), LOWEST)
+                odds[k] = max(log_odds(self._weights, seen), LOWEST)
         every = np.concatenate([self._odds, odds])
         self._odds = every[-SMOOTHED_MS + 1 :]
         # each sum by itself, so that it is the same in chunks of any length
