@@ -181,6 +181,7 @@ def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
     assert (value[slip_ms : slip_ms + 40] > LEVEL).any()
 
 
+@pytest.mark.quick(8)
 @pytest.mark.parametrize(
     "rates", [moving, slower, stopping, shaken, brushed, jolted, held_back, still]
 )

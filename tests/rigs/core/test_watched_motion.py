@@ -150,6 +150,7 @@ def test_limit_of_force_stops_any_motion(motion: Callable[[Rig], None]) -> None:
     assert rig.position().depth_mm < 0.0  # moved clear
 
 
+@pytest.mark.quick(3)
 @each_motion
 def test_motion_below_the_limit_runs_to_its_end(motion: Callable[[Rig], None]) -> None:
     rig = make_rig(limit_n=30.0)
