@@ -100,6 +100,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     What they share is made once then. Tests in real time name their groups themselves.
     """
+    _leave_further_cases(items)
     shared = {
         item.path: name
         for item in items
@@ -109,6 +110,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.get_closest_marker("realtime") is None:
             group = shared.get(item.path, str(item.path))
             item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _leave_further_cases(items: list[pytest.Item]) -> None:
+    """Of a test with the mark ``quick(n)``, mark all but `n` cases as long."""
+    cases: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("quick") is not None:
+            cases.setdefault(item.nodeid.split("[")[0], []).append(item)
+    for found in cases.values():
+        (few,) = found[0].get_closest_marker("quick").args  # type: ignore[union-attr]
+        for number, item in enumerate(found):
+            if number * few % len(found) >= few:
+                item.add_marker(pytest.mark.long)
 
 
 @pytest.hookimpl(optionalhook=True)

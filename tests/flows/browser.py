@@ -1,16 +1,15 @@
-"""Debian's Chromium for tests of pages; without playwright modules that import it are skipped."""
+"""Debian's Chromium for tests of pages; without it or playwright they are skipped."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 _CHROMIUM = "/usr/bin/chromium"
 _ARGUMENTS = (
     "--headless",
@@ -23,15 +22,24 @@ _ARGUMENTS = (
     "--disable-sync",
 )
 needs_browser = pytest.mark.skipif(
-    not (Path(_CHROMIUM).exists() and shutil.which(_CHROMIUM)),
-    reason=f"no browser at {_CHROMIUM} (Debian's package chromium)",
+    not (shutil.which(_CHROMIUM) and find_spec("playwright")),
+    reason=f"no browser at {_CHROMIUM} (Debian's package chromium), or no playwright",
 )
 PATIENCE_MS = 30_000
+
+
+def expect(*what: Any) -> Any:
+    """Playwright's own, imported where a page is looked at: most workers have none."""
+    from playwright import sync_api
+
+    return sync_api.expect(*what)
 
 
 @contextmanager
 def launched() -> Iterator[Any]:
     """Chromium, which finds nobody outside this computer."""
+    from playwright import sync_api
+
     sync_api.expect.set_options(timeout=PATIENCE_MS)
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=_CHROMIUM, args=list(_ARGUMENTS))

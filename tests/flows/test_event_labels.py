@@ -148,10 +148,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, marks=() if n else pytest.mark.long) for n, case in enumerate(CASES)],
-)
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("case", CASES)
 def test_lost_events_leave_the_gross_onset_right_or_in_doubt(
     case: str, slides: list[Recording]
 ) -> None:

@@ -146,6 +146,7 @@ def test_a_study_with_one_camera_runs_to_its_report(
     assert (store.folder / "report" / "figures" / "confusion.svg").exists()
 
 
+@pytest.mark.long  # as in `test_report`
 def test_sections_of_other_packages_stand_in_the_report(
     installed: Any, taken: Take, tmp_path: Path
 ) -> None:

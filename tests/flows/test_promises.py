@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sliplab.analysis.campaigns import collected, training_campaigns
-from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector, Evidence, Scene
-from sliplab.analysis.detectors.feeding import feed
-from sliplab.analysis.detectors.live import LiveDetector
-from sliplab.analysis.detectors.registry import make_detector
-from sliplab.analysis.detectors.stored_scenes import each_scene, fitted_to
+from sliplab.analysis.detectors.stored_scenes import fitted_to
 from sliplab.analysis.evaluation.evaluation import evaluation_of
-from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.flows.detecting.sources import named_source
 from sliplab.flows.evaluations import run_evaluation
 from sliplab.flows.store_detectors import detectors_of
@@ -124,29 +117,3 @@ def test_a_calibrated_detector_is_judged_on_stored_trials(store: Store, document
     assert "promised of holding" in said.stdout
     with pytest.raises(InputError, match="--margin = 2: is of networks"):
         run_evaluation(store.folder, None, model=document, margin=2)
-
-
-def test_a_running_stream_gives_the_stored_evidence_to_the_bit(
-    store: Store, document: Path
-) -> None:
-    labels, campaigns = StoreLabels(store), training_campaigns(collected(store))
-    rng = np.random.default_rng(2)
-    seen = 0
-    for scene in each_scene(labels, campaigns, "test"):
-        stored = feed(make_detector(str(document)), scene)
-        live = LiveDetector(
-            AtLevel(make_detector(str(document)), 13.0),
-            width=scene.width,
-            height=scene.height,
-            origin_us=5_000,
-        )
-        events = replace(scene.events, t_us=scene.events.t_us + 5_000)
-        cuts = np.sort(rng.integers(0, len(events), 200))
-        made = []
-        for part in np.split(np.arange(len(events)), cuts):
-            made += live.push(events[part])
-        made += live.advance(5_000 + scene.end_us)
-        assert [one.end_us - 5_000 for one in made] == stored.t_us.tolist()
-        assert [one.value for one in made] == stored.value.tolist()
-        seen += int((stored.value > 13).any())
-    assert seen > 0

@@ -51,6 +51,7 @@ def test_the_board_that_is_printed_is_the_one_that_is_simulated() -> None:
     )
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("lens", LENSES)
 def test_the_lens_that_drew_the_pictures_is_found(lens: str) -> None:
     true = camera(lens)

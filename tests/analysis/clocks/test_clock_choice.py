@@ -66,6 +66,7 @@ NOISES: dict[str, Noise] = {
 }
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("count", [70, 150, 1_000])
 @pytest.mark.parametrize("noise", NOISES)
 def test_a_straight_clock_gets_a_straight_line(noise: str, count: int) -> None:
@@ -104,6 +105,7 @@ def test_straight_clocks_are_fitted_as_exactly_as_by_a_straight_line() -> None:
     assert max(errors) <= 5_000
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("place", [0.5, 0.25])
 @pytest.mark.parametrize("deviations", [1.5, 2.5, 3.5])
 def test_the_stated_uncertainty_holds_for_bends_near_the_threshold(

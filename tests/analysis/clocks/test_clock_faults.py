@@ -39,6 +39,7 @@ def fitted(stamps: Ints, reference: Ints) -> ClockFit | None:
         return None
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize("seconds", [3.0, 6.0, 17.0])
 @pytest.mark.parametrize("share", [0.05, 0.1, 0.35, 0.5, 0.75, 0.9, 0.95])
 def test_a_jump_is_refused_or_inside_the_uncertainty(seconds: float, share: float) -> None:

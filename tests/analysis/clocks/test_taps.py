@@ -67,6 +67,7 @@ def two_clocks(rng: np.random.Generator, taps_s: F64, end_s: float) -> tuple[Tap
     return result, bool(((low <= true_ns) & (true_ns <= high)).all()), (high[0] - low[0]) / 2e9
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_the_truth_lies_within_the_interval(count: int) -> None:
     rng, held, halves = np.random.default_rng(count), [], []

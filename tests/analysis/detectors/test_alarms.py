@@ -76,8 +76,9 @@ def worlds_with_alarms(
     return found
 
 
-@pytest.mark.parametrize("shape", [100.0, 1.0])
-@pytest.mark.parametrize("draws", [20, pytest.param(400, marks=pytest.mark.long)])
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("draws", [20, 400])
+@pytest.mark.parametrize("shape", [1.0, 100.0])
 def test_a_promise_is_kept_in_new_worlds(draws: int, shape: float) -> None:
     rates = (1.0, 10.0, 30.0)
     rng = np.random.default_rng(7)

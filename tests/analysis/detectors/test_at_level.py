@@ -21,6 +21,10 @@ from tests.plugins.bench.made import Counting
 STEP_US = 10_000
 
 
+def numbers(text: str) -> list[float]:
+    return [*map(float, text.split())]
+
+
 def events(t_us: list[int]) -> EventChunk:
     n = len(t_us)
     zeros = np.zeros(n, np.uint16)
@@ -119,67 +123,12 @@ class Tips(Detector):
 
 
 def test_slip_goes_on_after_an_alarm_for_as_long_as_tips_slip() -> None:
-    nan = np.nan
-    value = [
-        5.0,
-        0.0,
-        20.0,
-        20.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        20.0,
-        0.0,
-        20.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    ]
-    share = [
-        0.1,
-        0.2,
-        0.0,
-        0.30,
-        0.6,
-        1.0,
-        0.0,
-        0.3,
-        nan,
-        0.98,
-        nan,
-        0.00,
-        0.0,
-        0.5,
-        0.98,
-        0.82,
-        0.7,
-    ]
+    value = numbers("5 0 20 20 0 0 0 0 0 20 0 20 0 0 0 0 0")
+    share = numbers("0.1 0.2 0 0.3 0.6 1 0 0.3 nan 0.98 nan 0 0 0.5 0.98 0.82 0.7")
     judged = AtLevel(Tips(value, share), 12.0)
     judged.begin(640, 480)
     found = judged.push(EventChunk.empty(), 17_000)
     assert found.label.tolist() == [0, 0, 1, 1, 1, 2, 0, 0, 0, 2, 0, 1, 0, 1, 2, 2, 1]
     assert found.slipped is not None
-    shown = [
-        0.0,
-        0.0,
-        0.0,
-        0.30,
-        0.6,
-        1.0,
-        0.0,
-        0.0,
-        nan,
-        0.98,
-        nan,
-        0.00,
-        0.0,
-        0.5,
-        0.98,
-        0.82,
-        0.7,
-    ]
+    shown = numbers("0 0 0 0.3 0.6 1 0 0 nan 0.98 nan 0 0 0.5 0.98 0.82 0.7")
     assert np.array_equal(found.slipped, shown, equal_nan=True)

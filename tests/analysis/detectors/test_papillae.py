@@ -181,6 +181,7 @@ def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
     assert (value[slip_ms : slip_ms + 40] > LEVEL).any()
 
 
+@pytest.mark.quick(8)
 @pytest.mark.parametrize(
     "rates", [moving, slower, stopping, shaken, brushed, jolted, held_back, still]
 )
@@ -238,6 +239,7 @@ def test_a_marker_that_turns_back_while_the_skin_is_unloaded_is_seen(
     assert (value[slip_ms : slip_ms + within_ms] > LEVEL).any()
 
 
+@pytest.mark.quick(7)
 @pytest.mark.parametrize(
     ("rates", "on"), [(shrinking, dark), (faster, dark), (shrinking, all_turn), (faster, all_turn)]
 )
@@ -265,6 +267,7 @@ def test_hot_pixels_that_go_out_are_no_slip() -> None:
     assert evidence(joined).max() < LEVEL
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("chunk_us", [1000, 7300, 10_000, 333_333])
 @pytest.mark.parametrize(("rates", "share"), [(one_stops, 1.0), (one_jumps, 0.02)])
 def test_evidence_is_the_same_to_the_bit_in_any_chunks(

@@ -112,6 +112,7 @@ def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
     return [float(np.linalg.norm(f - e.numpy()) / np.linalg.norm(e)) for f, e in pairs]
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("windows", "share"), [(TINY, 0.1), (TINY, 0.3), (FULL, 0.01), (FULL, 0.03)]
 )
@@ -221,6 +222,7 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
     assert min(losses[20:]) < losses[0] - 0.1
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("classes", [2, 5, 36])
 @pytest.mark.parametrize("windows", [TINY, TAXELS], ids=["crop", "taxels"])
 def test_gradients_of_any_number_of_classes(classes: int, windows: Windows) -> None:

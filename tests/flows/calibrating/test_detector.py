@@ -186,6 +186,7 @@ def test_a_promise_that_the_hold_does_not_show_is_refused(
         load_calibration(other)
 
 
+@pytest.mark.long  # simulated above; a trial through these drivers is in `test_loopback`
 @pytest.mark.realtime
 def test_it_runs_on_the_real_drivers(tmp_path: Path) -> None:
     out = tmp_path / "skin.json"

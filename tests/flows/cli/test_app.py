@@ -16,7 +16,7 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import SECRET, SLIPLAB, here, sliplab, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.programs import environment, running
+from tests.flows.programs import NO_SERVER, environment, running
 
 
 def test_plan_as_json() -> None:
@@ -129,9 +129,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.programs
-@pytest.mark.parametrize(
-    "number", [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
-)
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_collection_goes_on_to_the_same_data(
     number: signal.Signals, tmp_path: Path, undisturbed: dict[str, Any]
 ) -> None:
@@ -140,7 +139,7 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
     store = tmp_path / "stopped"
     command = ("collect", path, "--rig", "rehearsal", "--store", store, "--json")
     trials, aside = (store / "campaigns" / "tiny" / name for name in ("trials", "incoming"))
-    secret = environment(PREFECT_API_KEY=SECRET, AWS_SECRET_ACCESS_KEY=SECRET)
+    secret = environment(**NO_SERVER, PREFECT_API_KEY=SECRET, AWS_SECRET_ACCESS_KEY=SECRET)
     with running([*SLIPLAB, *command], log := tmp_path / "messages", secret) as process:
         wait_for(
             lambda: trials.is_dir() and len(list(trials.iterdir())) >= 2 and any(aside.iterdir()),

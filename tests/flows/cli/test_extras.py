@@ -150,10 +150,8 @@ TOGETHER = ["prefect", "report hardware", "parquet", "learn publish", "video clu
 """Extras that a process lacks: all at once where no command needs two of them."""
 
 
-FURTHER = [pytest.param(extras, marks=pytest.mark.long) for extras in TOGETHER[3:]]
-
-
-@pytest.mark.parametrize("extras", [*TOGETHER[:3], *FURTHER])
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("extras", TOGETHER)
 def test_a_command_says_which_extra_it_lacks(extras: str, store: Path, tmp_path: Path) -> None:
     lacked = extras.split()
     wanted = [(extra, *each) for extra in lacked for each in LACKING[extra].items()]

@@ -149,6 +149,9 @@ def test_a_protective_stop_at_a_point_ends_the_stretch(tmp_path: Path) -> None:
     at = work.rig.plate_frame.position(work.rig.arm.pose().xyz_mm)
     # the slide of 1.6 mm is centred on the plate
     assert (at.x_mm, at.y_mm, at.depth_mm) == pytest.approx((0.0, 0.0, 2.4), abs=1e-3)
+    (failed,) = campaign.quarantined()
+    assert failed["cause"].startswith("ArmFault: arm: protective stop")
+    assert campaign.failed_attempts() == {}
     kept = checksums(campaign)
     assert len(kept) == 1
     goes_on(tmp_path, kept)
@@ -188,6 +191,7 @@ def test_a_gate_sees_it_and_the_trial_is_taken_again(
     assert re.search(rf"{gate}(: | = )", failed["cause"])
     (recording,) = campaign.recordings()
     assert recording.record.attempt == 1
+    assert recording.record.quality.passed
     assert verify(Store.open(tmp_path / "store")) == []
 
 

@@ -99,6 +99,7 @@ def agree(live: Recording, run_request: RunRequest, tmp_path: Path) -> None:
     assert found[0] == pytest.approx(found[1], abs=AGREE_N)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("kind", "said"),
     [("device_silent", "nothing came for"), ("force_overload", "force or torque out of range")],

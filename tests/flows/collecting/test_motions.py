@@ -164,6 +164,7 @@ def twists(*angles_deg: int) -> dict[str, Any]:
     return data
 
 
+@pytest.mark.long  # a twist of the simulated arm is labelled above, and this driver tried apart
 @pytest.mark.realtime
 @pytest.mark.xdist_group("scene")
 def test_a_twist_of_an_abb_arm_is_labelled_as_it_was(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.core.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
@@ -83,21 +83,6 @@ def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
     assert verify(Store.open(tmp_path / "b" / "store")) == []
 
 
-def test_a_trial_that_fails_a_gate_is_taken_again(tmp_path: Path) -> None:
-    # begun on this rig: 1 is touching off, 2 the first trial
-    fault = {"kind": "frames_lost", "trial": 2, "at_s": 0.3, "count": 3}
-    work, campaign = session(tmp_path / "a", short(), faults=[fault])
-    take_all(work)
-    assert (work.taken, work.retaken) == (4, 1)
-    assert len(campaign.committed()) == 3
-    (failed,) = campaign.quarantined()
-    assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
-    again = campaign.recording(failed["trial"])
-    assert again.record.attempt == 1
-    assert again.record.quality.passed
-    assert verify(Store.open(tmp_path / "a" / "store")) == []
-
-
 def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     data = short()
     data["collection"]["gates"]["retakes"] = 1
@@ -111,20 +96,6 @@ def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     counts = run_request.counts(campaign)
     assert counts["planned"] == counts["committed"] + counts["missing"] == 3
     assert len(counts["set_aside"]) == 3
-
-
-def test_a_protective_stop_ends_the_stretch_and_loses_nothing(tmp_path: Path) -> None:
-    fault = {"kind": "arm_protective_stop", "trial": 3, "at_s": 0.7}
-    work, campaign = session(tmp_path / "a", short(), faults=[fault])
-    with pytest.raises(ArmFault, match="protective stop"):
-        take_all(work)
-    assert len(campaign.committed()) == 1
-    (kept,) = campaign.quarantined()
-    assert kept["cause"].startswith("ArmFault: arm: protective stop")
-    assert campaign.failed_attempts() == {}
-    again, campaign = session(tmp_path / "c", short())
-    take_all(again)
-    assert len(campaign.committed()) == 3
 
 
 def test_a_person_changes_the_plate_once_a_block(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def test_live_evidence_is_the_stored_one_to_the_bit(
     assert again["promise"]["per_hour"] == source.skin.hold.high  # type: ignore[union-attr]
 
 
+@pytest.mark.long  # `test_named` has another detector in its process
 def test_in_its_process_it_has_the_level_of_the_document(document: Path) -> None:
     source = named_source(str(document), None, None)
     process = DetectorProcess(source.name, source.level, None, answer_s=30.0)

@@ -124,6 +124,7 @@ def test_in_its_process_it_is_the_same_and_a_hang_ends_in_time() -> None:
     process.close()
 
 
+@pytest.mark.long  # `test_safe_state` has the network in its process
 def test_a_safe_state_has_it_in_a_process_of_its_own(protocol: Path, tmp_path: Path) -> None:
     rig = write(tmp_path / "r.yaml", {"extends": str(RIG), "reflex": {"safe_state": "stop"}})
     source = named_source("always", 0.5, None)

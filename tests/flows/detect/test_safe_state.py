@@ -358,6 +358,7 @@ def test_the_network_in_its_process_is_the_network_and_a_hang_ends_in_time(model
     network.close()
 
 
+@pytest.mark.long  # `test_detect_ends` has one that is refused before
 def test_a_model_that_is_none_does_not_start(tmp_path: Path) -> None:
     bad = tmp_path / "bad.pt"
     bad.write_text(json.dumps({}))

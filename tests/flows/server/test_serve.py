@@ -165,16 +165,16 @@ def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: 
 
     data = campaign.protocol(2)
     claim = {"figure": "first_slip", "at_most": "60 s"}
-    data["collection"] |= {"repetitions": 9, "stopping": {"error": 0.4, "claims": [claim]}}
+    data["collection"] |= {"repetitions": 7, "stopping": {"error": 0.4, "claims": [claim]}}
     protocol = tmp_path / "claims.yaml"
     protocol.write_text(yaml.safe_dump(data))
     state = collect(Collect(protocol=protocol), return_state=True)
     assert state.type.value == "COMPLETED", state.message
     record = StoppingRecord.load(service.folder / "campaigns" / data["name"] / STOPPING)
     assert record.verdict == "settled"
-    assert f"{record.looks[-1].taken} of 18 committed" in state.message
+    assert f"{record.looks[-1].taken} of 14 committed" in state.message
     state = collect(Collect(protocol=protocol, no_stopping=True), return_state=True)
-    assert "18 of 18 committed" in state.message
+    assert "14 of 14 committed" in state.message
 
 
 def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
+from tests.flows.browser import PATIENCE_MS, expect, launched, needs_browser
 from tests.flows.server.serving import Service
 
 pytestmark = [needs_browser, pytest.mark.programs]
@@ -22,7 +22,6 @@ def browser() -> Iterator[Any]:
 @pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("localhost", marks=pytest.mark.long)])
 def test_a_person_logs_in_and_runs_something(served: Service, browser: Any, host: str) -> None:
     page = served.page
-    expect = sync_api.expect
     with browser.new_context() as context:
         tab = context.new_page()
         tab.set_default_timeout(PATIENCE_MS)

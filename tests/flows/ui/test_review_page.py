@@ -21,11 +21,10 @@ import pytest
 from sliplab.storage.trials import review
 from tests.analysis.labels.reviewable import DOUBTFUL, NAME, Reviewable, label
 from tests.conftest import ROOT
-from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
+from tests.flows.browser import PATIENCE_MS, expect, launched, needs_browser
 
 TRIALS = 864
 pytestmark = [pytest.mark.programs, needs_browser]
-expect = sync_api.expect
 
 
 @dataclass

@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,9 @@ from tests.analysis.labels import reviewable
 from tests.analysis.labels.reviewable import EVENTS, FRAMES, NAME, Reviewable, events, frame_times
 from tests.flows.listening import listening
 
-chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (sliplab[view])")
+pytestmark = pytest.mark.skipif(
+    find_spec("rerun") is None, reason="Rerun is not installed (sliplab[view])"
+)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +49,10 @@ class Read:
     """An .rrd file by Rerun's own reader: times, int64 ns, and cells of every entity."""
 
     def __init__(self, path: Path) -> None:
+        from rerun.chunk import RrdReader  # most workers need none of it
+
         self.columns: dict[tuple[str, str], list[tuple[int | None, Any]]] = {}
-        for chunk in chunks.RrdReader(path).stream():
+        for chunk in RrdReader(path).stream():
             table = chunk.to_record_batch()
             times = [None] * table.num_rows
             if view.TIMELINE in table.schema.names:

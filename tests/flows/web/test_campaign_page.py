@@ -15,7 +15,7 @@ from sliplab.flows.running import run_records
 from sliplab.flows.status import StatusReader
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
-from tests.flows.browser import launched, needs_browser, sync_api
+from tests.flows.browser import expect, launched, needs_browser
 from tests.flows.conftest import write
 from tests.flows.live import quick, rig_yaml
 from tests.flows.server.serving import serving, until
@@ -78,7 +78,6 @@ class Person:
 
     def sees(self, place: str, text: str) -> None:
         """Wait until a part of the page has a text."""
-        expect = sync_api.expect
         expect(self.tab.locator(place, has_text=text).first).to_be_visible(timeout=LIMIT_MS)
 
 
@@ -102,7 +101,7 @@ def drive(browser: Any, link: str, folder: Path, protocol: str, planned: int) ->
     anna.note("lens cleaned", "0043")
     anna.sees("#status li", "")  # what the new skin asks for
     anna.act("Resume", "Resume", Reason="")
-    sync_api.expect(anna.tab.locator("#status .notice")).to_have_count(0, timeout=LIMIT_MS)
+    expect(anna.tab.locator("#status .notice")).to_have_count(0, timeout=LIMIT_MS)
     anna.stop()
     anna.sees("#now .big", "Nothing runs")
     store = Store.open(folder)

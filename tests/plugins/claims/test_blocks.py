@@ -37,6 +37,7 @@ def of(blocks: np.ndarray) -> MeanEstimate:
     )
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("above", [True, False])
 def test_a_true_mean_is_seldom_called_wrong(case: str, above: bool) -> None:

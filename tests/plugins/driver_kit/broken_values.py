@@ -28,6 +28,7 @@ from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.storage.streams import EventChunk, PoseChunk
 from tests.plugins.driver_kit.broken import Broken
+from tests.protocols.planning import rows
 
 Change = Callable[[Any], Any]
 COUNTER = 1 << 32
@@ -311,156 +312,56 @@ def swapped_stops(state: ArmState) -> ArmState:
     return ArmState.EMERGENCY_STOP if state is ArmState.PROTECTIVE_STOP else state
 
 
-SPEED, CALLS, POSES, HOST = "speed and length", "calls while moving", "poses", "host times"
-TURN, TILT, WRAPS = "orientation", "limits of turn and depth", "counter wraps"
-ARMS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "TenTimesTooFast": (
-        moves(lambda self, v: [*v[:6], 10 * v[6]]),
-        (SPEED,),
-        "followed at .* instead of 40 mm/s",
+ARMS: dict[str, type[Any]] = {
+    "TenTimesTooFast": moves(lambda self, v: [*v[:6], 10 * v[6]]),
+    "SpeedIgnored": moves(lambda self, v: [*v[:6], 50.0]),
+    "SlowMovesTooFast": moves(lambda self, v: [*v[:6], max(v[6], 10.0)]),
+    "StopsOnce": StopsOnce,
+    "MovesAfterStop": MovesAfterStop,
+    "DropsThirdSegment": takes(ExampleArm, "start", lambda self, path: (path[:2],)),
+    "LastSegmentOnly": LastSegmentOnly,
+    "EmergencyIsReady": reports(ExampleArm, taken_for_ready(ArmState.EMERGENCY_STOP), "state"),
+    "OffIsReady": reports(ExampleArm, taken_for_ready(ArmState.NOT_RUNNING), "state"),
+    "ProgressAlwaysReady": reports(ExampleArm, always_ready, "progress"),
+    "PosesAveraged": reports(ExampleArm, averaged, "read_poses"),
+    "ArmHostTimeOfRead": ArmHostTimeOfRead,
+    "TurnsTwiceTooFast": moves(turns_twice),
+    "CommandsRadians": moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]),
+    "CutsCorners": CutsCorners,
+    "HostSegmentTimes": reports(ExampleArm, host_spans, "progress"),
+    "DoneTooEarly": DoneTooEarly,
+    "KeepsFinished": KeepsFinished,
+    "ReadyWhileMoving": reports(ExampleArm, ready, "state"),
+    "StopsSwapped": reports(ExampleArm, swapped_stops, "state"),
+    "ProgressWaits": ProgressWaits,
+    "StopDoesNotWait": StopDoesNotWait,
+    "TiltNotChecked": takes(ExampleArm, "start", without_tilt),
+    "PosesInMetres": poses(scaled(xyz_mm=1e-3)),
+    "PosesInRadians": poses(scaled(rotvec_deg=np.pi / 180)),
+    "ScalarPartLast": poses(scalar_last),
+    "AxesSwapped": reports(ExampleArm, scaled(xyz_mm=[1, 0, 2]), "read_poses"),
+    "HeightFlipped": reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"),
+    "SamplesTwice": SamplesTwice,
+    "NewestSampleOnly": reports(ExampleArm, lambda c: c[-1:], "read_poses"),
+    "LosesLastSample": reports(ExampleArm, lambda c: c[:-1], "read_poses"),
+    "HostTimeIsZero": reports(ExampleArm, at_host(lambda: 0), "read_poses"),
+    "HostTimeOld": reports(
+        ExampleArm, lambda c: replace(c, host_ns=c.host_ns - 600_000_000), "read_poses"
     ),
-    "SpeedIgnored": (moves(lambda self, v: [*v[:6], 50.0]), (SPEED,), "followed at 50.0 mm/s"),
-    "SlowMovesTooFast": (
-        moves(lambda self, v: [*v[:6], max(v[6], 10.0)]),
-        (SPEED,),
-        "10.0 mm/s instead of 2 mm/s",
+    "HostWallClock": reports(ExampleArm, at_host(time.time_ns), "read_poses"),
+    "HostTimeStands": reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"),
+    "CommandedPose": CommandedPose,
+    "PoseLate": PoseLate,
+    "ClockStands": ClockStands,
+    "ClockInMicroseconds": reports(
+        reports(ExampleArm, us("t_ns"), "read_poses"), lambda t_ns: t_ns // 1000, "now_ns"
     ),
-    "StopsOnce": (StopsOnce, ("stop while moving",), "still moving when the call"),
-    "MovesAfterStop": (MovesAfterStop, ("stop while moving",), "still moving when the call|moved"),
-    "DropsThirdSegment": (
-        takes(ExampleArm, "start", lambda self, path: (path[:2],)),
-        ("path",),
-        "before the end",
+    "ArmCounterWraps": takes(ExampleArm, "_take", lambda self, line: (counted(line),)),
+    "PulsesLate": reports(
+        ExampleArm, lambda c: replace(c, t_ns=c.t_ns + 60_000_000), "read_pulses"
     ),
-    "LastSegmentOnly": (LastSegmentOnly, ("limits",), "that leaves the box and returns"),
-    "EmergencyIsReady": (
-        reports(ExampleArm, taken_for_ready(ArmState.EMERGENCY_STOP), "state"),
-        ("emergency stop",),
-        "no call reported it",
-    ),
-    "OffIsReady": (
-        reports(ExampleArm, taken_for_ready(ArmState.NOT_RUNNING), "state"),
-        ("power off",),
-        "no call reported it",
-    ),
-    "ProgressAlwaysReady": (
-        reports(ExampleArm, always_ready, "progress"),
-        (CALLS, "protective stop"),
-        "the state of its progress was",
-    ),
-    "PosesAveraged": (
-        reports(ExampleArm, averaged, "read_poses"),
-        (POSES,),
-        "read_poses returned",
-    ),
-    "ArmHostTimeOfRead": (ArmHostTimeOfRead, (HOST,), "of all poses of a read was the same"),
-    "TurnsTwiceTooFast": (moves(turns_twice), ("turn",), "followed at 40.0 deg/s instead of 20"),
-    "CommandsRadians": (
-        moves(lambda self, v: [*v[:3], *np.radians(v[3:6]), v[6]]),
-        (TURN,),
-        "orientation was",
-    ),
-    "CutsCorners": (CutsCorners, (SPEED,), "came no nearer to the end of segment 1"),
-    "HostSegmentTimes": (
-        reports(ExampleArm, host_spans, "progress"),
-        (SPEED,),
-        "segment 1 was reported to begin",
-    ),
-    "DoneTooEarly": (DoneTooEarly, ("path", CALLS), "before the end of the path"),
-    "KeepsFinished": (KeepsFinished, ("path",), "4 segments of the next path, of one"),
-    "ReadyWhileMoving": (
-        reports(ExampleArm, ready, "state"),
-        (CALLS,),
-        "its state was ArmState.READY",
-    ),
-    "StopsSwapped": (
-        reports(ExampleArm, swapped_stops, "state"),
-        ("protective stop",),
-        "its state was ArmState.EMERGENCY_STOP",
-    ),
-    "ProgressWaits": (ProgressWaits, (CALLS,), "had not returned before the arm was at rest"),
-    "StopDoesNotWait": (StopDoesNotWait, ("stop while moving",), "still moving when the call"),
-    "TiltNotChecked": (
-        takes(ExampleArm, "start", without_tilt),
-        (TILT,),
-        "turns the tool too far",
-    ),
-    "PosesInMetres": (poses(scaled(xyz_mm=1e-3)), (POSES,), r"pose returned \(0\.4"),
-    "PosesInRadians": (
-        poses(scaled(rotvec_deg=np.pi / 180)),
-        (TURN,),
-        "returned the rotation vector",
-    ),
-    "ScalarPartLast": (poses(scalar_last), (TURN,), "returned the rotation vector"),
-    "AxesSwapped": (
-        reports(ExampleArm, scaled(xyz_mm=[1, 0, 2]), "read_poses"),
-        (POSES,),
-        "read_poses returned",
-    ),
-    "HeightFlipped": (
-        reports(ExampleArm, scaled(xyz_mm=np.array([1, 1, -1])), "read_poses"),
-        (POSES,),
-        ", -3",
-    ),
-    "SamplesTwice": (SamplesTwice, (POSES,), "was read twice"),
-    "NewestSampleOnly": (
-        reports(ExampleArm, lambda c: c[-1:], "read_poses"),
-        (POSES,),
-        "returned 1 samples of 0.000 s",
-    ),
-    "LosesLastSample": (
-        reports(ExampleArm, lambda c: c[:-1], "read_poses"),
-        (POSES,),
-        "each read loses some",
-    ),
-    "HostTimeIsZero": (
-        reports(ExampleArm, at_host(lambda: 0), "read_poses"),
-        (HOST,),
-        "host_ns was 0, received",
-    ),
-    "HostTimeOld": (
-        reports(ExampleArm, lambda c: replace(c, host_ns=c.host_ns - 600_000_000), "read_poses"),
-        (HOST,),
-        "was 0.* s old when it was read",
-    ),
-    "HostWallClock": (
-        reports(ExampleArm, at_host(time.time_ns), "read_poses"),
-        (HOST,),
-        "host_ns was 1",
-    ),
-    "HostTimeStands": (
-        reports(ExampleArm, at_host(cache(time.monotonic_ns)), "read_poses"),
-        (HOST,),
-        "host_ns (was|of)",
-    ),
-    "CommandedPose": (CommandedPose, (POSES,), "and not there in the"),
-    "PoseLate": (PoseLate, (POSES,), "and not there in the"),
-    "ClockStands": (ClockStands, ("clock",), "now_ns went on by -?0|came when now_ns"),
-    "ClockInMicroseconds": (
-        reports(reports(ExampleArm, us("t_ns"), "read_poses"), lambda t_ns: t_ns // 1000, "now_ns"),
-        ("clock",),
-        "now_ns went on by|came when now_ns",
-    ),
-    "ArmCounterWraps": (
-        takes(ExampleArm, "_take", lambda self, line: (counted(line),)),
-        (WRAPS,),
-        "fell back",
-    ),
-    "PulsesLate": (
-        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns + 60_000_000), "read_pulses"),
-        ("sync input",),
-        "or more from its rising edge",
-    ),
-    "NoPulses": (
-        reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"),
-        ("sync input",),
-        "0 of about 4 pulses",
-    ),
-    "FallingEdges": (
-        takes(ExampleArm, "_take", lambda self, line: (inverted(line),)),
-        ("sync input",),
-        "from the nearest rising edge",
-    ),
+    "NoPulses": reports(ExampleArm, lambda c: replace(c, t_ns=c.t_ns[:0]), "read_pulses"),
+    "FallingEdges": takes(ExampleArm, "_take", lambda self, line: (inverted(line),)),
 }
 
 
@@ -627,163 +528,64 @@ def _read(base: type[Any], change: Change) -> type[Any]:
     return reports(base, change, "read")
 
 
-DATA = ("data",)
-EVENTS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "SizeSwapped": (SizeSwapped, ("sensor size",), "width and height were 48 x 64"),
-    "ColumnsSwapped": (
-        _read(ExampleEvents, lambda c: replace(c, x=c.y, y=c.x)),
-        DATA,
-        "x came otherwise",
-    ),
-    "PolarityInverted": (
-        _read(ExampleEvents, lambda c: replace(c, p=1 - c.p)),
-        DATA,
-        "p came otherwise",
-    ),
-    "PolaritySigned": (
-        _read(ExampleEvents, lambda c: replace(c, p=c.p.astype(np.int8) * 2 - 1)),
-        ("arrays",),
-        "p was an array of int8",
-    ),
-    "EventsInNanoseconds": (
-        _read(ExampleEvents, scaled(t_us=1000)),
-        DATA,
-        "t_us came otherwise|were sent and",
-    ),
-    "EventCounterWraps": (
-        _read(ExampleEvents, lambda c: replace(c, t_us=c.t_us % COUNTER)),
-        (WRAPS,),
-        "came after",
-    ),
-    "EventsTwice": (EventsTwice, DATA, "came after|were sent and"),
-    "OneEventATime": (_read(ExampleEvents, first_of_each_time), DATA, "were sent and"),
-    "PulsesInMicroseconds": (
-        reports(ExampleEvents, us("t_ns"), "read_pulses"),
-        DATA,
-        "pulses up to",
-    ),
-    "StopDrops": (StopDrops, ("read after stop",), "could not be read after it"),
-    "OldPulses": (OldPulses, ("fresh start",), "began with pulses of the first one"),
-    "ReadWaits": (ReadWaits, ("read at once",), "read took"),
+EVENTS: dict[str, type[Any]] = {
+    "SizeSwapped": SizeSwapped,
+    "ColumnsSwapped": _read(ExampleEvents, lambda c: replace(c, x=c.y, y=c.x)),
+    "PolarityInverted": _read(ExampleEvents, lambda c: replace(c, p=1 - c.p)),
+    "PolaritySigned": _read(ExampleEvents, lambda c: replace(c, p=c.p.astype(np.int8) * 2 - 1)),
+    "EventsInNanoseconds": _read(ExampleEvents, scaled(t_us=1000)),
+    "EventCounterWraps": _read(ExampleEvents, lambda c: replace(c, t_us=c.t_us % COUNTER)),
+    "EventsTwice": EventsTwice,
+    "OneEventATime": _read(ExampleEvents, first_of_each_time),
+    "PulsesInMicroseconds": reports(ExampleEvents, us("t_ns"), "read_pulses"),
+    "StopDrops": StopDrops,
+    "OldPulses": OldPulses,
+    "ReadWaits": ReadWaits,
 }
-FRAMES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "Transposed": (
-        _read(FakedExampleFrames, lambda c: replace(c, images=c.images.transpose(0, 2, 1))),
-        ("region",),
-        "frames of",
+FRAMES: dict[str, type[Any]] = {
+    "Transposed": _read(
+        FakedExampleFrames, lambda c: replace(c, images=c.images.transpose(0, 2, 1))
     ),
-    "UpsideDown": (
-        _read(FakedExampleFrames, lambda c: replace(c, images=c.images[:, ::-1])),
-        DATA,
-        "images came otherwise",
-    ),
-    "StartOfExposure": (StartOfExposure, DATA, "t_ns up to 50.* was sent"),
-    "LevelInverted": (
-        _read(FakedExampleFrames, lambda c: replace(c, sync=1 - c.sync)),
-        ("level of the sync line",),
-        "of the sync line, and came with",
-    ),
-    "HostTimeOfCamera": (
-        _read(FakedExampleFrames, lambda c: replace(c, host_ns=c.t_ns)),
-        (HOST,),
-        "host_ns was",
-    ),
-    "HostTimeOfRead": (
-        _read(FakedExampleFrames, at_host(time.monotonic_ns)),
-        (HOST,),
-        "after a sample was sent",
-    ),
-    "FrameCounterWraps": (
-        _read(FakedExampleFrames, wrapped("t_ns", 1000)),
-        (WRAPS,),
-        "came after",
-    ),
-    "FrameNumberOf16Bits": (
-        _read(FakedExampleFrames, lambda c: replace(c, number=c.number % 2**16)),
-        ("lost frames",),
-        "number came otherwise",
-    ),
-    "NumbersOfItsOwn": (NumbersOfItsOwn, ("lost frames",), "number came otherwise"),
-    "RegionStays": (RegionStays, ("another region",), "frames of"),
+    "UpsideDown": _read(FakedExampleFrames, lambda c: replace(c, images=c.images[:, ::-1])),
+    "StartOfExposure": StartOfExposure,
+    "LevelInverted": _read(FakedExampleFrames, lambda c: replace(c, sync=1 - c.sync)),
+    "HostTimeOfCamera": _read(FakedExampleFrames, lambda c: replace(c, host_ns=c.t_ns)),
+    "HostTimeOfRead": _read(FakedExampleFrames, at_host(time.monotonic_ns)),
+    "FrameCounterWraps": _read(FakedExampleFrames, wrapped("t_ns", 1000)),
+    "FrameNumberOf16Bits": _read(FakedExampleFrames, lambda c: replace(c, number=c.number % 2**16)),
+    "NumbersOfItsOwn": NumbersOfItsOwn,
+    "RegionStays": RegionStays,
 }
-FORCE: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "MilliNewtons": (_read(ExampleForce, scaled(force_n=1e3)), DATA, "force_n came otherwise"),
-    "NewtonMillimetres": (
-        _read(ExampleForce, scaled(torque_nm=1e3)),
-        DATA,
-        "torque_nm came otherwise",
-    ),
-    "Reaction": (_read(ExampleForce, scaled(force_n=-1.0)), DATA, "force_n came otherwise"),
-    "ForceAxesSwapped": (
-        _read(ExampleForce, scaled(force_n=[2, 1, 0])),
-        DATA,
-        "force_n came otherwise",
-    ),
-    "BufferReused": (BufferReused, DATA, "a read changed the arrays"),
-    "OneLoad": (_read(ExampleForce, first_load), DATA, "force_n came otherwise"),
-    "ForceHostTimeIsZero": (_read(ExampleForce, at_host(lambda: 0)), (HOST,), "host_ns was 0"),
-    "ForceCounterWraps": (
-        _read(ExampleForce, wrapped("t_ns", 1_000_000)),
-        (WRAPS,),
-        "came after",
-    ),
-    "ZeroOnce": (ZeroOnce, ("zero",), "was not zero after a second zero"),
-    "ZeroHides": (ZeroHides, ("zero",), "its change was not read"),
+FORCE: dict[str, type[Any]] = {
+    "MilliNewtons": _read(ExampleForce, scaled(force_n=1e3)),
+    "NewtonMillimetres": _read(ExampleForce, scaled(torque_nm=1e3)),
+    "Reaction": _read(ExampleForce, scaled(force_n=-1.0)),
+    "ForceAxesSwapped": _read(ExampleForce, scaled(force_n=[2, 1, 0])),
+    "BufferReused": BufferReused,
+    "OneLoad": _read(ExampleForce, first_load),
+    "ForceHostTimeIsZero": _read(ExampleForce, at_host(lambda: 0)),
+    "ForceCounterWraps": _read(ExampleForce, wrapped("t_ns", 1_000_000)),
+    "ZeroOnce": ZeroOnce,
+    "ZeroHides": ZeroHides,
 }
-BOXES: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "SeedIgnored": (
-        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed and 77, code)),
-        ("trains",),
-        "the box sent 200 Hz, seed 77",
+BOXES: dict[str, type[Any]] = {
+    "SeedIgnored": takes(
+        ExampleSync, "start", lambda self, hz, seed, code: (hz, seed and 77, code)
     ),
-    "CodeIgnored": (
-        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed, "lfsr")),
-        ("trains",),
-        "and code lfsr",
+    "CodeIgnored": takes(ExampleSync, "start", lambda self, hz, seed, code: (hz, seed, "lfsr")),
+    "HalfTheRate": takes(ExampleSync, "start", lambda self, hz, seed, code: (hz / 2, seed, code)),
+    "KeepsTicking": KeepsTicking,
+    "BoxClockInMicroseconds": reports(ExampleSync, us("device_ns"), "read_clock"),
+    "BoxHostWallClock": reports(ExampleSync, wall_reads, "read_clock"),
+    "ClockOfPowerOn": reports(
+        ExampleSync, lambda c: replace(c, device_ns=c.device_ns + 3_000_000_000), "read_clock"
     ),
-    "HalfTheRate": (
-        takes(ExampleSync, "start", lambda self, hz, seed, code: (hz / 2, seed, code)),
-        ("trains",),
-        "the box sent 100 Hz",
+    "BoxCounterWraps": reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"),
+    "PulseCounterWraps": reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"),
+    "EndOfPulses": reports(
+        ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"
     ),
-    "KeepsTicking": (KeepsTicking, ("ticks stop",), "the box still ticked"),
-    "BoxClockInMicroseconds": (
-        reports(ExampleSync, us("device_ns"), "read_clock"),
-        ("clock",),
-        "the clock went on by",
-    ),
-    "BoxHostWallClock": (
-        reports(ExampleSync, wall_reads, "read_clock"),
-        ("clock",),
-        "times before and after",
-    ),
-    "ClockOfPowerOn": (
-        reports(
-            ExampleSync, lambda c: replace(c, device_ns=c.device_ns + 3_000_000_000), "read_clock"
-        ),
-        ("clock at start",),
-        "after start its clock was",
-    ),
-    "BoxCounterWraps": (
-        reports(ExampleSync, wrapped("device_ns", 1000), "read_clock"),
-        (WRAPS,),
-        "went on by",
-    ),
-    "PulseCounterWraps": (
-        reports(ExampleSync, wrapped("t_ns", 1000), "read_pulses"),
-        (WRAPS,),
-        "no pulse had|silent for",
-    ),
-    "EndOfPulses": (
-        reports(ExampleSync, lambda c: replace(c, t_ns=c.t_ns + 2_500_000), "read_pulses"),
-        DATA,
-        "pulses came at",
-    ),
-    "ExposuresInMicroseconds": (
-        reports(ExampleSync, us("t_ns"), "read_exposures"),
-        ("exposures",),
-        "an exposure between",
-    ),
+    "ExposuresInMicroseconds": reports(ExampleSync, us("t_ns"), "read_exposures"),
 }
 
 
@@ -856,37 +658,20 @@ def percent(self: ExampleGripper, line: str) -> tuple[str]:
     return (" ".join([word, *values]),)
 
 
-MOVE, STATE = "values of a move", "state while moving"
-GRIPPERS: dict[str, tuple[type[Any], tuple[str, ...], str]] = {
-    "OpensToClose": (
-        takes(ExampleGripper, "move", lambda self, mm, *rest: (80.0 - mm, *rest)),
-        (MOVE, "move of the fingers"),
-        "requested",
+GRIPPERS: dict[str, type[Any]] = {
+    "OpensToClose": takes(ExampleGripper, "move", lambda self, mm, *rest: (80.0 - mm, *rest)),
+    "GripperSpeedIgnored": takes(
+        ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)
     ),
-    "GripperSpeedIgnored": (
-        takes(ExampleGripper, "move", lambda self, mm, speed, force: (mm, 90.0, force)),
-        (MOVE,),
-        "the fingers went at",
+    "GripperForceInPercent": takes(ExampleGripper, "_send", percent),
+    "OpeningInSteps": reports(
+        ExampleGripper, lambda s: replace(s, opening_mm=10 * s.opening_mm), "state"
     ),
-    "GripperForceInPercent": (
-        takes(ExampleGripper, "_send", percent),
-        (MOVE,),
-        "the gripper was sent",
-    ),
-    "OpeningInSteps": (
-        reports(ExampleGripper, lambda s: replace(s, opening_mm=10 * s.opening_mm), "state"),
-        (STATE,),
-        "the fingers were at",
-    ),
-    "TargetReported": (TargetReported, (STATE,), "the fingers were at"),
-    "RestsTooEarly": (RestsTooEarly, (STATE, MOVE), "while the fingers moved it reported"),
-    "StopOpens": (StopOpens, ("stop of the fingers",), "the fingers opened to 80 mm after"),
-    "StopWaitsForAnswer": (
-        StopWaitsForAnswer,
-        ("silent gripper",),
-        "it waited for the answer to another call",
-    ),
-    "OpensOnConnect": (OpensOnConnect, ("fingers stay",), "the fingers went from"),
+    "TargetReported": TargetReported,
+    "RestsTooEarly": RestsTooEarly,
+    "StopOpens": StopOpens,
+    "StopWaitsForAnswer": StopWaitsForAnswer,
+    "OpensOnConnect": OpensOnConnect,
 }
 
 
@@ -899,8 +684,109 @@ def _declared(declaration: Driver[Any], name: str, device: type[Any]) -> Driver[
     return replace(declaration, **changes)
 
 
+# driver | rules that are about its defect | what the first of them finds
+FOUND = r"""
+    TenTimesTooFast | speed and length | followed at .* instead of 40 mm/s
+    SpeedIgnored | speed and length | followed at 50.0 mm/s
+    SlowMovesTooFast | speed and length | 10.0 mm/s instead of 2 mm/s
+    StopsOnce | stop while moving | still moving when the call
+    MovesAfterStop | stop while moving | still moving when the call|moved
+    DropsThirdSegment | path | before the end
+    LastSegmentOnly | limits | that leaves the box and returns
+    EmergencyIsReady | emergency stop | no call reported it
+    OffIsReady | power off | no call reported it
+    ProgressAlwaysReady | calls while moving, protective stop | the state of its progress was
+    PosesAveraged | poses | read_poses returned
+    ArmHostTimeOfRead | host times | of all poses of a read was the same
+    TurnsTwiceTooFast | turn | followed at 40.0 deg/s instead of 20
+    CommandsRadians | orientation | orientation was
+    CutsCorners | speed and length | came no nearer to the end of segment 1
+    HostSegmentTimes | speed and length | segment 1 was reported to begin
+    DoneTooEarly | path, calls while moving | before the end of the path
+    KeepsFinished | path | 4 segments of the next path, of one
+    ReadyWhileMoving | calls while moving | its state was ArmState.READY
+    StopsSwapped | protective stop | its state was ArmState.EMERGENCY_STOP
+    ProgressWaits | calls while moving | had not returned before the arm was at rest
+    StopDoesNotWait | stop while moving | still moving when the call
+    TiltNotChecked | limits of turn and depth | turns the tool too far
+    PosesInMetres | poses | pose returned \(0\.4
+    PosesInRadians | orientation | returned the rotation vector
+    ScalarPartLast | orientation | returned the rotation vector
+    AxesSwapped | poses | read_poses returned
+    HeightFlipped | poses | , -3
+    SamplesTwice | poses | was read twice
+    NewestSampleOnly | poses | returned 1 samples of 0.000 s
+    LosesLastSample | poses | each read loses some
+    HostTimeIsZero | host times | host_ns was 0, received
+    HostTimeOld | host times | was 0.* s old when it was read
+    HostWallClock | host times | host_ns was 1
+    HostTimeStands | host times | host_ns (was|of)
+    CommandedPose | poses | and not there in the
+    PoseLate | poses | and not there in the
+    ClockStands | clock | now_ns went on by -?0|came when now_ns
+    ClockInMicroseconds | clock | now_ns went on by|came when now_ns
+    ArmCounterWraps | counter wraps | fell back
+    PulsesLate | sync input | or more from its rising edge
+    NoPulses | sync input | 0 of about 4 pulses
+    FallingEdges | sync input | from the nearest rising edge
+    SizeSwapped | sensor size | width and height were 48 x 64
+    ColumnsSwapped | data | x came otherwise
+    PolarityInverted | data | p came otherwise
+    PolaritySigned | arrays | p was an array of int8
+    EventsInNanoseconds | data | t_us came otherwise|were sent and
+    EventCounterWraps | counter wraps | came after
+    EventsTwice | data | came after|were sent and
+    OneEventATime | data | were sent and
+    PulsesInMicroseconds | data | pulses up to
+    StopDrops | read after stop | could not be read after it
+    OldPulses | fresh start | began with pulses of the first one
+    ReadWaits | read at once | read took
+    Transposed | region | frames of
+    UpsideDown | data | images came otherwise
+    StartOfExposure | data | t_ns up to 50.* was sent
+    LevelInverted | level of the sync line | of the sync line, and came with
+    HostTimeOfCamera | host times | host_ns was
+    HostTimeOfRead | host times | after a sample was sent
+    FrameCounterWraps | counter wraps | came after
+    FrameNumberOf16Bits | lost frames | number came otherwise
+    NumbersOfItsOwn | lost frames | number came otherwise
+    RegionStays | another region | frames of
+    MilliNewtons | data | force_n came otherwise
+    NewtonMillimetres | data | torque_nm came otherwise
+    Reaction | data | force_n came otherwise
+    ForceAxesSwapped | data | force_n came otherwise
+    BufferReused | data | a read changed the arrays
+    OneLoad | data | force_n came otherwise
+    ForceHostTimeIsZero | host times | host_ns was 0
+    ForceCounterWraps | counter wraps | came after
+    ZeroOnce | zero | was not zero after a second zero
+    ZeroHides | zero | its change was not read
+    SeedIgnored | trains | the box sent 200 Hz, seed 77
+    CodeIgnored | trains | and code lfsr
+    HalfTheRate | trains | the box sent 100 Hz
+    KeepsTicking | ticks stop | the box still ticked
+    BoxClockInMicroseconds | clock | the clock went on by
+    BoxHostWallClock | clock | times before and after
+    ClockOfPowerOn | clock at start | after start its clock was
+    BoxCounterWraps | counter wraps | went on by
+    PulseCounterWraps | counter wraps | no pulse had|silent for
+    EndOfPulses | data | pulses came at
+    ExposuresInMicroseconds | exposures | an exposure between
+    OpensToClose | values of a move, move of the fingers | requested
+    GripperSpeedIgnored | values of a move | the fingers went at
+    GripperForceInPercent | values of a move | the gripper was sent
+    OpeningInSteps | state while moving | the fingers were at
+    TargetReported | state while moving | the fingers were at
+    RestsTooEarly | state while moving, values of a move | while the fingers moved it reported
+    StopOpens | stop of the fingers | the fingers opened to 80 mm after
+    StopWaitsForAnswer | silent gripper | it waited for the answer to another call
+    OpensOnConnect | fingers stay | the fingers went from
+"""
+
+
 WRONG_VALUES = tuple(
-    Broken(_declared(declaration, name, device), rules, seen)
+    Broken(_declared(declaration, name, table[name]), tuple(rules.split(", ")), "|".join(seen))
+    for name, rules, *seen in rows(FOUND)
     for declaration, table in (
         (arm.DRIVER, ARMS),
         (events.DRIVER, EVENTS),
@@ -909,6 +795,6 @@ WRONG_VALUES = tuple(
         (sync.DRIVER, BOXES),
         (gripper.DRIVER, GRIPPERS),
     )
-    for name, (device, rules, seen) in table.items()
+    if name in table
 )
 """Each driver with wrong magnitudes, with the rules that apply and the first rule's finding."""

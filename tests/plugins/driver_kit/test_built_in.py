@@ -123,9 +123,13 @@ DEVICES = {
     "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
+FURTHER = {"ur_wrench"}  # over the connection of the arm, whose rules are tried
 
 
-@pytest.mark.parametrize("name", DEVICES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(it, marks=pytest.mark.long if it in FURTHER else ()) for it in DEVICES],
+)
 def test_a_driver_that_ships_keeps_every_rule(name: str) -> None:
     make, not_simulated = DEVICES[name]
     at_once = {"at_once": 1} if name in ONE_AT_A_TIME else {}

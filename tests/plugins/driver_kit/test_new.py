@@ -19,7 +19,6 @@ from tests.rigs.waiting import own_address
 
 _OFFLINE = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--no-compile")
 LIMIT_S = 300
-USUAL = {"arm", "gripper"}
 
 
 def run(*words: object, cwd: Path, site: Path) -> str:
@@ -139,10 +138,8 @@ def test_a_kind_or_a_folder_that_is_none_is_refused_in_a_line(tmp_path: Path) ->
 
 
 @pytest.mark.programs
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(k, marks=() if k in USUAL else pytest.mark.long) for k in KINDS],
-)
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("kind", KINDS)
 def test_an_installed_package_keeps_every_rule_and_its_rig_file_is_valid(
     kind: str, tmp_path: Path
 ) -> None:

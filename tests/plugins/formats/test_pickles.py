@@ -51,6 +51,7 @@ def test_the_child_process_gives_what_the_reader_gives() -> None:
     assert parse_pickle(pickle.dumps(value), "x") == value
 
 
+@pytest.mark.quick(11)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize(
     "array",

@@ -9,6 +9,7 @@ import pytest
 from sliplab.plugins.publish.sparse_png import sparse_pngs
 
 
+@pytest.mark.quick(13)
 @pytest.mark.parametrize(
     ("height", "width", "share"),
     [(480, 640, 0.0), (480, 640, 1e-4), (1, 1, 1.0), (1, 87, 0.02), (7, 5, 0.5), (61, 83, 1.0)],

@@ -165,6 +165,7 @@ def test_a_tilted_plate_is_a_plane_through_the_gaps(clean: dict[str, float]) -> 
     assert found[BROKEN] == 0.0
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("papilla", [0, 3, 12])
 def test_a_sticky_papilla_stands_out(clean: dict[str, float], papilla: int) -> None:
     friction = np.where(np.arange(19) == papilla, 1.6, 1.0)
@@ -227,6 +228,7 @@ def lit(share: float, hz: float = 100.0, scans_hz: float = 0.0, seed: int = 0) -
     return found
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("hz", [50.0, 100.0, 120.0, 333.0])
 def test_a_light_makes_a_line(hz: float) -> None:
     # the largest of 481 means of 32 logarithms; a light of a tenth would be 4 times the noise

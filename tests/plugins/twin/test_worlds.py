@@ -54,6 +54,7 @@ def test_depth_zero_is_right_with_the_rigs_own_touch_depth() -> None:
     assert abs(zero_errors_mm(own, [77])[0]) < 0.06
 
 
+@pytest.mark.long
 def test_touches_that_differ_leave_no_common_error_of_depth() -> None:
     rig, _ = load_rig_file(shipped_rigs()["rehearsal"])
     few_pixels = {

@@ -124,6 +124,7 @@ def test_what_is_met_before_creeping_stops_the_arm() -> None:
     assert rig.arm.state() is ArmState.READY
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("looks", [0, 3, 60, 150, 400])
 @pytest.mark.parametrize("way", [None, find], ids=["events", "markers"])
 def test_a_stop_request_stops_the_arm_first(looks: int, way: Any) -> None:

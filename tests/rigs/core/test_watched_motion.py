@@ -150,6 +150,7 @@ def test_limit_of_force_stops_any_motion(motion: Callable[[Rig], None]) -> None:
     assert rig.position().depth_mm < 0.0  # moved clear
 
 
+@pytest.mark.quick(3)
 @each_motion
 def test_motion_below_the_limit_runs_to_its_end(motion: Callable[[Rig], None]) -> None:
     rig = make_rig(limit_n=30.0)
@@ -304,6 +305,7 @@ def test_sensor_at_fault_before_a_trial_keeps_the_arm_out_of_contact(how: str) -
     assert rig.arm.progress().done
 
 
+@pytest.mark.quick(7)
 @pytest.mark.parametrize("how", FAULTS)
 @pytest.mark.parametrize("motion", [trial, watched_trial], ids=lambda motion: motion.__name__)
 def test_sensor_that_dies_in_mid_slide_stops_the_arm(motion: Any, how: str) -> None:
@@ -324,6 +326,7 @@ def test_sensor_that_dies_in_mid_slide_stops_the_arm(motion: Any, how: str) -> N
     assert rig.position().depth_mm < 0.0  # a dead sensor does not keep the arm in contact
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("motion", [trial, watched_trial, warm_up, circles, lone_move])
 @pytest.mark.parametrize("mounting", [Mounting(), Mounting(rotvec_deg=(180.0, 0.0, 0.0))])
 def test_sensor_whose_normal_axis_is_dead_stops_a_press(motion: Any, mounting: Mounting) -> None:

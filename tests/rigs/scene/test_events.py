@@ -54,6 +54,7 @@ def test_the_profile_and_its_inverse() -> None:
     assert rim_of(2.09, 2.08, 0.8) < -1e5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("v", [(37.0, 0.0), (0.0, -21.0), (13.0, 29.0), (-2.0, 0.7)])
 def test_a_disc_that_moves_straight_fires_at_the_closed_form_times(v: tuple[float, float]) -> None:
     optics = EventOptics(**QUIET)

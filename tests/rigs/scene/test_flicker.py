@@ -44,6 +44,7 @@ def stepped(
     return found
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("off", [None, 0.13])
 @pytest.mark.parametrize(("share", "hz"), [(0.1, 100.0), (0.31, 120.0), (0.5, 77.0)])
 def test_events_are_those_of_a_pixel_stepped_through_time(

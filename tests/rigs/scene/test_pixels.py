@@ -177,6 +177,7 @@ def test_side_by_side_is_as_one_by_one(seed: int, px: float, smooth: float) -> N
     assert near(gaps, expected_gaps, rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("seed", "px"), [(1, 0.6), (2, 2.0), (3, 6.0)])
 def test_times_are_roots_on_the_path(seed: int, px: float) -> None:
     a = look(seed, px, 0.9)

@@ -496,23 +496,6 @@ def test_damaged_and_hostile_files_leave_nothing(tmp_path: Path, name: str) -> N
     assert left == ["store.json"]
 
 
-def test_a_damaged_file_of_a_folder_does_not_stop_the_others(tmp_path: Path) -> None:
-    files = tmp_path / "files"
-    files.mkdir()
-    lab_hdf5(files / "a.h5")
-    lab_hdf5(files / "c.h5")
-    with h5py.File(files / "b.h5", "w") as file:
-        _columns(t=[6, 5])(file)
-        file["events/ts"] = [1.0]
-    made = Store.create(tmp_path / "store")
-    result = import_trials(made, "theirs", trials_in(files, "lab-hdf5"), files, "lab-hdf5")
-    (failed,) = result["failed"]
-    assert (failed["trial"], failed["file"]) == ("b", "b.h5")
-    assert "b.h5: has no column events/xs" in failed["reason"]
-    assert made.campaign("theirs").committed() == {"a", "c"}
-    assert verify(made) == []
-
-
 @pytest.mark.parametrize("file", ["../t.h5", "/etc/passwd", "t\0.h5", "", "gone.h5", "link.h5"])
 def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> None:
     out = tmp_path / "out"

@@ -183,6 +183,7 @@ SPARSE = {
 }
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", SPARSE)
 def test_a_gap_costs_neither_memory_nor_a_window(name: str, tmp_path: Path) -> None:
     whole = _sparse(SPARSE[name])

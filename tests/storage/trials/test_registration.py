@@ -156,8 +156,9 @@ def test_missing_registration_is_named(where: Campaign) -> None:
 def test_damaged_earlier_registration_refuses_another_one(where: Campaign) -> None:
     (first,) = registered(where)
     os.chmod(first, 0o644)
-    first.write_text("{}")
-    with pytest.raises(StoreError, match=r"0001\.json"):
+    first.write_text(first.read_text().replace('"planned": 3', '"planned": 4'))
+    said = r"0001\.json.* does not match its checksum; restore it from a copy"
+    with pytest.raises(StoreError, match=said):
         registered(where)
     assert registration_files(where) == [first]
 
@@ -188,13 +189,6 @@ def test_stamp_goes_to_the_registration_it_is_of(where: Any, tmp_path: Path, end
     stamp.write_bytes(bytes.fromhex("3059 020101") + bytes.fromhex(sha256(files[0])))
     with pytest.raises(InputError, match=r"is no response of a time|is no proof of OpenTimestamps"):
         attach_stamp(files, stamp)
-
-
-def test_nothing_is_registered_after_a_damaged_registration(path: Path, where: Campaign) -> None:
-    path.chmod(0o644)
-    path.write_text(path.read_text().replace('"planned": 3', '"planned": 4'))
-    with pytest.raises(StoreError, match="does not match its checksum; restore it from a copy"):
-        registered(where)
 
 
 def test_second_authority_does_not_overwrite_the_first(where: Campaign, tmp_path: Path) -> None:

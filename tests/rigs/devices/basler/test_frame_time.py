@@ -7,46 +7,26 @@ from typing import Any
 import pytest
 
 from sliplab.rigs.devices.basler.frame_time import Abilities, FrameStamping, choose
+from tests.protocols.planning import rows
 
-ALL = Abilities(
-    chunk=True, result=True, event=True, latch=True, sync_level=True, exposure_line=True
-)
+# what the camera has | its trigger | the time stamp, and its grade
+BEST = """
+    chunk result event latch sync_level exposure_line | hardware | chunk | hardware trigger
+    chunk result event latch sync_level exposure_line | free run | chunk | exposure line
+    chunk latch | hardware | chunk | device time stamps
+    result latch | free run | grab result | device time stamps
+    event exposure_line | free run | exposure end event | exposure line
+    event | free run | host arrival | host arrival
+    latch | free run | host arrival | host arrival
+    exposure_line sync_level | hardware | host arrival | host arrival
+    chunk | software | host arrival | host arrival
+"""
 
 
-@pytest.mark.parametrize(
-    ("has", "trigger", "expected"),
-    [
-        (ALL, "hardware", FrameStamping("chunk", "hardware trigger")),
-        (ALL, "free run", FrameStamping("chunk", "exposure line")),
-        (
-            Abilities(chunk=True, latch=True),
-            "hardware",
-            FrameStamping("chunk", "device time stamps"),
-        ),
-        (
-            Abilities(result=True, latch=True),
-            "free run",
-            FrameStamping("grab result", "device time stamps"),
-        ),
-        (
-            Abilities(event=True, exposure_line=True),
-            "free run",
-            FrameStamping("exposure end event", "exposure line"),
-        ),
-        (Abilities(event=True), "free run", FrameStamping("host arrival", "host arrival")),
-        (Abilities(latch=True), "free run", FrameStamping("host arrival", "host arrival")),
-        (
-            Abilities(exposure_line=True, sync_level=True),
-            "hardware",
-            FrameStamping("host arrival", "host arrival"),
-        ),
-        (Abilities(chunk=True), "software", FrameStamping("host arrival", "host arrival")),
-    ],
-)
-def test_the_best_that_the_camera_has(
-    has: Abilities, trigger: Any, expected: FrameStamping
-) -> None:
-    assert choose(has, trigger) == expected
+@pytest.mark.parametrize(("has", "trigger", "stamp", "grade"), rows(BEST))
+def test_the_best_that_the_camera_has(has: str, trigger: Any, stamp: Any, grade: Any) -> None:
+    found = choose(Abilities(**dict.fromkeys(has.split(), True)), trigger)
+    assert found == FrameStamping(stamp, grade)
 
 
 def test_the_middle_lies_after_a_start_and_before_an_end() -> None:
