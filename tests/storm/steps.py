@@ -192,7 +192,7 @@ def night(process: Process, step: dict[str, Any]) -> None:
     planned_s = sum(request.plan.seconds(trial) for trial in request.plan)
     host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
     # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces
-    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.1
+    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.2
     disturbed = any({"lie", "suspend"} & event.keys() for event in step.get("events", ()))
     witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or disturbed))
     witness.install()
@@ -449,7 +449,7 @@ def react(process: Process, step: dict[str, Any]) -> None:
         trial=measured[step["trial"] % len(measured)].rpartition(",r=")[0],
         detector=named_source("rate", step["level"], None),
         reflex=step["reflex"],
-        poll_s=0.05,
+        poll_s=0.2,
     )
     done = detect(wanted, show=False)
     alarm, reflex = done["onsets"]["incipient"], done["reflex"]
