@@ -96,6 +96,8 @@ def draw(seed: int) -> Story:
     # with a force limit, which is looked at all the time, a second costs six times as much
     hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 0.5, 5, 60, 240])
     events = "events" in rig.get("cameras", ["events"])
+    if hold_s > 5:
+        rig["poll"] = "1 s"
     story = {"seed": seed, "protocol": _protocol(rng, hold_s, events), "rig": rig}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
     kinds = [kind for kind in STEPS if events or kind not in OF_EVENTS]
