@@ -170,8 +170,8 @@ class Ledger:
             if not cause:
                 raise Wrong("a log is true", f"quarantine/{name} has no cause")
             failed = cause.removeprefix("gate: ").split("; ") if cause.startswith("gate") else ()
-            # the protocols' limits of the clocks are close, so that some attempts are over them
-            odd = [each for each in failed if not each.startswith("sync_uncertainty")]
+            # limits of the clocks are close, so that chance alone is beyond them now and then
+            odd = [each for each in failed if not each.startswith("sync_")]
             if odd and calm and name.rpartition(".")[0] not in self.unfinished:
                 raise Wrong("what is in order passes its gates", f"{name}: {odd}")
         self.aside = aside
