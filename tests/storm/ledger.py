@@ -212,6 +212,9 @@ class Ledger:
             raise Wrong("what is committed is whole", f"{name}: {problem.what}")
         for text in differences(folder, self._sent[name]["sent"]):
             raise Wrong("what was sent is stored", f"{name}: {text}")
+        for path in folder.iterdir():
+            if path.stat().st_mode & 0o222:
+                raise Wrong("what is committed is protected", f"{name}/{path.name}")
         recording = Recording(folder)
         record = recording.record
         trial = self._plan[name]

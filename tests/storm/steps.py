@@ -225,6 +225,9 @@ def night(process: Process, step: dict[str, Any]) -> None:
         while trials:
             session.collector.take(trials)
             trials = session.more() if step.get("most") is None else []
+        left = request.due_trials(store.campaign(request.campaign))
+        if left and step.get("most") is None and not control.open_requests(store):
+            witness.wrong("a night takes all that is due", f"{[each.id for each in left]} are left")
 
 
 def _wait(host: Host, seconds: float) -> None:
