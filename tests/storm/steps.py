@@ -452,7 +452,7 @@ def react(process: Process, step: dict[str, Any]) -> None:
         trial=measured[step["trial"] % len(measured)].rpartition(",r=")[0],
         detector=named_source("rate", step["level"], None),
         reflex=step["reflex"],
-        poll_s=0.2,
+        poll_s=0.05,
     )
     done = detect(wanted, show=False)
     alarm, reflex = done["onsets"]["incipient"], done["reflex"]
