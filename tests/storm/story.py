@@ -94,7 +94,7 @@ def draw(seed: int) -> Story:
     rng = random.Random(seed)
     rig = _rig(rng)
     # with a force limit, which is looked at all the time, a second costs six times as much
-    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 0.5, 5, 60, 240])
+    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 5, 60, 240])
     events = "events" in rig.get("cameras", ["events"])
     if hold_s > 5:
         rig["poll"] = "1 s"
