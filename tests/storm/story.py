@@ -263,7 +263,7 @@ def _lie(rng: random.Random, story: Story) -> Step:
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
-    most = rng.choice([None, 1, 2, 2, 3])  # so that later nights have trials left
+    most = rng.choice([None, None, 1, 2, 2, 3])  # so that later nights have trials left
     night_s = (most or trials) * _trial_s(story)
     events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3, 4]))]
     for event in [each for each in events if each.get("ask") == "pause"]:
@@ -351,7 +351,7 @@ STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "carry": (0.4, _carry),
     "react": (0.3, _react),
     "probe": (0.6, _probe),
-    "alert": (0.4, _serve),
+    "alert": (1, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
 OF_EVENTS = {"carry", "react"}
