@@ -16,7 +16,7 @@ from sliplab.storage.trials.checksums import CHECKSUMS, ELSEWHERE, RECORD, read_
 from sliplab.storage.trials.prefix_journal import drop_journal
 from sliplab.storage.trials.store import CAUSE, Campaign
 from sliplab.storage.trials.verify import content_problems, verify_trial
-from sliplab.storage.trials.writer import finish_folder, make_visible
+from sliplab.storage.trials.writer import finish_folder, make_visible, protect_folder
 
 
 def recover(campaign: Campaign) -> list[str]:
@@ -44,6 +44,7 @@ def _commit(campaign: Campaign, folder: Path) -> bool:
         finish_folder(folder)
     if _problems(lambda: verify_trial(folder)):
         return False
+    protect_folder(folder)  # a kill may have come right before that
     make_visible(folder, target)
     return True
 

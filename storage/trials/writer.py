@@ -57,7 +57,12 @@ def finish_folder(folder: Path, cause: Json | None = None) -> None:
     write_json_aside(folder / CHECKSUMS, as_json(sums))
     if cause is not None:
         write_json_aside(folder / "cause.json", cause)
-    for name in (*sums, CHECKSUMS, PROVENANCE):
+    protect_folder(folder)
+
+
+def protect_folder(folder: Path) -> None:
+    """Protect the files of a trial's folder that has its checksums, and flush its entries."""
+    for name in (*data_files(folder), RECORD, CHECKSUMS, PROVENANCE):
         protect(folder / name)
     sync_folder(folder)
 

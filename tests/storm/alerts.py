@@ -56,6 +56,9 @@ def watch(store: Store, host: Host, notes: Notes, seed: int, lost: float) -> Non
     watcher = AlertWatcher(store, settings, [*people], _now(host), lambda text: None)
     for look in range(LOOKS):
         host.wall_s += LOOK_S
+        if look == LOOKS // 4:  # the program begins anew, an hour later
+            host.wall_s += 3600
+            watcher = AlertWatcher(store, settings, [*people], _now(host), lambda text: None)
         for person in people:
             person.lost = lost if look < LOOKS - CALM_LOOKS else 0.0
         watcher.look(_now(host))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import random
 from concurrent.futures import Executor, Future
 from contextlib import suppress
@@ -25,8 +26,11 @@ from tests.storm.virtual import Notes
 POLL_S = 1.0
 STOP_LIMIT_S = 30.0
 """Time that a run has to stop its arm and end."""
+BEGIN_S = 1000.0
 CALM_S = 250
 """Until when runs come due and answers get lost."""
+LONGEST_S = 6000
+"""Until all of them have ended, and the service, too."""
 ZONES = ("UTC", "Europe/Rome", "America/New_York")
 
 
@@ -69,7 +73,7 @@ class Page:
 
     def __init__(self, rng: random.Random, notes: Notes, store: Path, lost: float) -> None:
         self._rng, self._notes, self._store, self.lost = rng, notes, store, lost
-        self.now_s = 1000.0
+        self.now_s = BEGIN_S
         self.runs: dict[UUID, Any] = {}
         self.processes: list[_Process] = []
 
@@ -151,6 +155,9 @@ class Page:
     def tick(self) -> None:
         """Let a second pass."""
         self.now_s += POLL_S
+        if self.now_s > BEGIN_S + LONGEST_S:
+            self.wrong("waits are bounded", f"{LONGEST_S} s and no end")
+            os._exit(97)
         for process in self.processes:
             if process.returncode is not None:
                 continue

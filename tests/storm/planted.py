@@ -15,15 +15,17 @@ from typing import Any
 from sliplab.analysis import quality, references
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows import status
-from sliplab.flows.collecting import live_feed, requests, session, supervisor, watches
-from sliplab.flows.server import runs, schedules
+from sliplab.flows.collecting import requests, session, supervisor, watches
+from sliplab.flows.server import runs
+from sliplab.plugins.alerts import outbox
+from sliplab.plugins.record import recorder
 from sliplab.rigs.core import force_watch, guard, motion_watch, rig
 from sliplab.rigs.core.capabilities import ArmState
 from sliplab.storage import files
 from sliplab.storage.remote import objects, pull
 from sliplab.storage.remote import push as pushing
 from sliplab.storage.streams import NullSink
-from sliplab.storage.trials import checksums, control, journal, lock, recovery, store, writer
+from sliplab.storage.trials import control, journal, recovery, store, writer
 
 PLANTS: dict[str, Callable[[], None]] = {}
 
@@ -55,41 +57,9 @@ def data_unflushed() -> None:
 
 
 @plant
-def json_unflushed() -> None:
-    """Small files are replaced without a flush of the new one's bytes."""
-
-    def write(path: Path, blocks: Any, mode: int = 0o666) -> None:
-        temporary = files.temporary_path(path)
-        temporary.write_bytes(b"".join(blocks))
-        os.replace(temporary, path)
-        files.sync_folder(path.parent)
-
-    files.write_blocks = write  # type: ignore[assignment]
-
-
-@plant
 def recovery_trusts() -> None:
     """Recovery commits whatever has a record, whole or not."""
     recovery._problems = lambda check: False
-
-
-@plant
-def recovery_gone() -> None:
-    """A complete trial that a kill kept from its commit is set aside as interrupted."""
-    session.recover = lambda campaign: []
-
-
-@plant
-def sweep_deletes() -> None:
-    """What a killed program left is deleted, and not set aside."""
-    sweep = store.Campaign.sweep
-
-    def deleting(campaign: store.Campaign) -> int:
-        for path in campaign.folders("incoming"):
-            shutil.rmtree(path)
-        return sweep(campaign)
-
-    store.Campaign.sweep = deleting  # type: ignore[method-assign]
 
 
 @plant
@@ -116,26 +86,6 @@ def journal_reuses() -> None:
         return True
 
     journal.Journal.add = add  # type: ignore[method-assign]
-
-
-@plant
-def skip_forgets() -> None:
-    """Skipping a trial forgets those that were skipped before."""
-    known, written = control.skipped, control.write_json
-
-    def write(path: Path, data: Any) -> None:
-        last = list(data)[-1:] if path.name == control.SKIPPED else list(data)
-        written(path, {name: data[name] for name in last})
-
-    control.write_json = write  # type: ignore[attr-defined]
-    assert known is control.skipped
-
-
-@plant
-def lock_shared() -> None:
-    """The store's lock does not exclude a second program."""
-    lock._locks = lambda handle, path: True
-    lock._check = nothing  # type: ignore[assignment]
 
 
 @plant
@@ -177,15 +127,6 @@ def pull_unchecked() -> None:
     pull.verify_trial = lambda folder: []  # type: ignore[attr-defined]
 
 
-@plant
-def unmarked() -> None:
-    """A simulated trial's record does not say so."""
-    made = session.TrialCollector._record
-    session.TrialCollector._record = lambda self, *given: made(self, *given).model_copy(  # type: ignore[method-assign]
-        update={"simulated": False}
-    )
-
-
 # -- clocks --------------------------------------------------------------------------------------
 
 
@@ -211,92 +152,7 @@ def retracts_always() -> None:
     ArmState.healthy = property(lambda self: True)  # type: ignore[assignment,method-assign]
 
 
-@plant
-def retracts_fast() -> None:
-    """The way out of the plate knows no limit of speed."""
-    rig.Rig.at_most = lambda self, speed_mm_s: 20 * speed_mm_s  # type: ignore[method-assign]
-    guard.Guard._speed = nothing  # type: ignore[method-assign]
-
-
-@plant
-def limits_unwatched() -> None:
-    """Poses on the way are not held against the limits."""
-    guard.Guard.check_measured = nothing  # type: ignore[method-assign]
-    motion_watch.MotionWatch.look = nothing  # type: ignore[method-assign]
-
-
-@plant
-def stop_forgotten() -> None:
-    """After a failure the arm is sent clear without a stop before."""
-    rig.Rig._stop_arm = lambda self: None  # type: ignore[method-assign]
-
-
-@plant
-def disk_unwatched() -> None:
-    """A trial begins although the disk has no room for it."""
-    watches.DiskWatch.check = nothing  # type: ignore[method-assign]
-
-
-@plant
-def pause_unheard() -> None:
-    """A paused collection goes on."""
-    supervisor.CollectionSupervisor._wait_while_paused = nothing  # type: ignore[method-assign]
-
-
-@plant
-def pause_keeps_zero() -> None:
-    """After a pause depth zero and warm-up of before are believed."""
-    session.TrialCollector.fresh_start = nothing  # type: ignore[method-assign]
-
-
-@plant
-def feed_stays() -> None:
-    """The thread of the live page does not end with its session."""
-    publish = live_feed.LiveFeed._publish
-
-    def staying(self: live_feed.LiveFeed) -> None:
-        publish(self)
-        live_feed.threading.Event().wait(30)
-
-    live_feed.LiveFeed._publish = staying  # type: ignore[method-assign]
-
-
-# -- what others see -----------------------------------------------------------------------------
-
-
-@plant
-def status_counts_parts() -> None:
-    """The status counts folders that are incomplete."""
-    status.incomplete = lambda folder: None  # type: ignore[attr-defined]
-
-
-@plant
-def answer_early() -> None:
-    """A request is answered without being carried out."""
-    requests.control.skip = lambda where, trials, by: dict.fromkeys(trials, "set aside")  # type: ignore[attr-defined]
-
-
 # -- a second set: defects that came to mind after the storm was written ---------------------------
-
-
-@plant
-def chunk_lost() -> None:
-    """Every fortieth chunk of a trial is not written."""
-    add, seen = writer.TrialWriter.add, [0]
-
-    def losing(self: writer.TrialWriter, device: str, chunk: Any) -> None:
-        seen[0] += 1
-        if seen[0] % 40:
-            add(self, device, chunk)
-
-    writer.TrialWriter.add = losing  # type: ignore[method-assign]
-
-
-@plant
-def zero_by_feel() -> None:
-    """Depth zero is where the touch was detected, and not where it began."""
-    touch = rig.Rig.touch_off
-    rig.Rig.touch_off = lambda self, *given: touch(self, *given) + 0.3  # type: ignore[method-assign]
 
 
 @plant
@@ -314,21 +170,9 @@ def skin_once() -> None:
 
 
 @plant
-def attempts_forgotten() -> None:
-    """Each session begins to number a trial's attempts anew, so that their seeds repeat."""
-    store.Campaign.attempts = lambda self: {}  # type: ignore[method-assign]
-
-
-@plant
 def retakes_forgotten() -> None:
     """Failed attempts of earlier sessions do not count."""
     store.Campaign.failed_attempts = lambda self: {}  # type: ignore[method-assign]
-
-
-@plant
-def window_open() -> None:
-    """A trial begins although the window is over."""
-    supervisor.CollectionSupervisor._check_window = nothing  # type: ignore[method-assign]
 
 
 @plant
@@ -357,24 +201,12 @@ def silence_passes() -> None:
 
 
 @plant
-def drift_passes() -> None:
-    """A reference trial that has drifted does not end the night."""
-    references.ReferenceDrift.beyond = property(lambda self: False)  # type: ignore[assignment,method-assign]
-
-
-@plant
 def interval_third() -> None:
     """The stated uncertainty of a clock is a third of what it is: too little for one trial."""
     made = synchronise.DeviceSync.record
     synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
         replace(self, uncertainty_ns=self.uncertainty_ns / 3)
     )
-
-
-@plant
-def sizes_only() -> None:
-    """A file with all its bytes is taken for unchanged."""
-    checksums.Checksum.problem = lambda self, path: self.size_problem(path)  # type: ignore[method-assign]
 
 
 @plant
@@ -402,19 +234,6 @@ def run_lost() -> None:
             self._asked = None
 
     runs.ServedRuns._begin = forgetting  # type: ignore[method-assign]
-
-
-@plant
-def killed_early() -> None:
-    """A run that is to stop is killed before its arm can be at rest."""
-    runs.STOP_LIMIT_S = 3.0  # type: ignore[misc]
-
-
-@plant
-def window_in_utc() -> None:
-    """The end of a window is taken by the clock of Greenwich."""
-    end = schedules.window_end
-    schedules.window_end = lambda due, until, zone: end(due, until, "UTC")  # type: ignore[assignment]
 
 
 # -- a third set, of kinds that the two before do not have -----------------------------------------
@@ -451,32 +270,11 @@ def zero_of_skin() -> None:
 
 
 @plant
-def newest_first() -> None:
-    """Of requests that wait, the newest is carried out first."""
-    known = control.open_requests
-    control.open_requests = lambda where: known(where)[::-1]
-
-
-@plant
 def tail_lost() -> None:
     """What devices still hold when their streams stop is not read."""
     stop = rig.Rig.stop_streams
 
     rig.Rig.stop_streams = lambda self, sink: stop(self, NullSink())  # type: ignore[method-assign]
-
-
-@plant
-def rate_short() -> None:
-    """A clock's rate is taken for nine tenths of what it was found to be."""
-    made = synchronise.DeviceSync.record
-
-    def slower(self: synchronise.DeviceSync) -> Any:
-        known = self.map
-        if len(known.drift) == 1:
-            known = replace(known, drift=(round(0.9 * known.drift[0]),))
-        return made(replace(self, map=known))
-
-    synchronise.DeviceSync.record = slower  # type: ignore[method-assign]
 
 
 @plant
@@ -532,30 +330,6 @@ def path_unjudged() -> None:
 
 
 @plant
-def gap_unjudged() -> None:
-    """The gate of the events' gaps sees none."""
-    quality.longest_silence_s = lambda *given, **named: 0.0
-
-
-@plant
-def delays_short() -> None:
-    """A message is thought to arrive within a tenth of its longest delay."""
-    sent = synchronise._sent
-
-    def short(device_ns: Any, arrived_ns: Any, delay: Any) -> Any:
-        tenth = delay.model_copy(update={"longest_us": 0.1 * delay.longest_us})
-        return sent(device_ns, arrived_ns, tenth)
-
-    synchronise._sent = short
-
-
-@plant
-def forgives_nothing() -> None:
-    """A trial that is asked for again keeps its failed attempts."""
-    control._reset_attempts = lambda *given: 0
-
-
-@plant
 def retracts_home() -> None:
     """After a failure the arm leaves towards the plate's centre, and not straight out."""
     made = rig.Position
@@ -598,32 +372,6 @@ def reference_previous() -> None:
 
 
 @plant
-def warm_once() -> None:
-    """After a pause, or with another skin, the skin is not warmed up again."""
-
-    def fresh(self: session.TrialCollector) -> None:
-        self._previous, self._zero_slot = None, None
-
-    session.TrialCollector.fresh_start = fresh  # type: ignore[method-assign]
-
-
-@plant
-def zeroed_once() -> None:
-    """The force sensor is zeroed before the first trial of a session only."""
-    zero = rig.Rig._zero_forces
-
-    def once(self: rig.Rig) -> None:
-        if not self._zeroed:
-            zero(self)
-        elif self.force is not None:
-            self._end_watch()
-            if self._often:
-                self._watch_forces()
-
-    rig.Rig._zero_forces = once  # type: ignore[method-assign]
-
-
-@plant
 def status_by_name() -> None:
     """A trial that the status has seen counts from then on, whatever happens to its folder."""
     folders, known = status.StatusReader._folders, dict[str, Any]()
@@ -648,8 +396,74 @@ def never_kills() -> None:
     runs.ServedRuns._terminate = patient  # type: ignore[method-assign]
 
 
+# -- a fifth set: bounds, tails, tellings and requests ---------------------------------------------
+
+
 @plant
-def first_day_only() -> None:
-    """Of the days of a schedule only the first one counts."""
-    cron = schedules.cron_of
-    schedules.cron_of = lambda days, begin: cron(days[:1], begin)
+def box_exact() -> None:
+    """What is known by the host's clock only is as exact as if the box's were known exactly."""
+    made = synchronise._through_host
+
+    def exact(bounded: Any, *given: Any) -> Any:
+        return replace(made(bounded, *given), uncertainty_ns=bounded.uncertainty_ns)
+
+    synchronise._through_host = exact
+
+
+@plant
+def arrival_undelayed() -> None:
+    """A message is thought to be sent when it arrives."""
+    made = synchronise._by_arrival
+    no_delay = {"shortest_us": 0, "longest_us": 0}
+    synchronise._by_arrival = lambda delay, *given: made(delay.model_copy(update=no_delay), *given)
+
+
+@plant
+def record_tail() -> None:
+    """What was pushed last before a recording's trial ends is not written."""
+    drain = recorder.RecordedTrial._drain
+
+    def draining(self: Any, writer: Any, begun: Any, last: bool = False) -> None:
+        if not last:
+            drain(self, writer, begun)
+
+    recorder.RecordedTrial._drain = draining  # type: ignore[method-assign]
+
+
+@plant
+def told_again() -> None:
+    """Who was told of an event is not on the disk, so that another program tells it again."""
+    outbox.write_json = nothing  # type: ignore[attr-defined]
+
+
+@plant
+def again_skipped() -> None:
+    """A trial that was skipped and is wanted after all stays skipped."""
+    again = control.again
+
+    def staying(campaign: store.Campaign, trials: Any, by: Any) -> dict[str, str]:
+        known = control.skipped(campaign)
+        did = again(campaign, trials, by)
+        if known:
+            control.write_json(campaign.folder / control.SKIPPED, known)
+        return did
+
+    requests.control.again = staying  # type: ignore[attr-defined]
+
+
+@plant
+def more_forgotten() -> None:
+    """A trial that is wanted again in a night is left to the next one."""
+    supervisor.CollectionSupervisor.more = lambda self: []  # type: ignore[method-assign]
+
+
+@plant
+def left_writable() -> None:
+    """The files of a committed trial are not protected from being written to."""
+    writer.protect = nothing  # type: ignore[attr-defined]
+
+
+@plant
+def measured_wide() -> None:
+    """A pose on the way may be three millimetres beyond the limits."""
+    guard.MEASURED_MM = 3.0  # type: ignore[misc]

@@ -181,7 +181,11 @@ class Player:
         self.played.trace += [f"{name}: {json.dumps(note)}" for note in found]
         self._check_end(step, end, found, how, text)
         damaged = {*self._ledger.damaged}
-        self._ledger.look(found, how != "killed")
+        disturbing = {"lie", "suspend", "clock"}
+        calm = not step.get("faults") and not any(
+            disturbing & event.keys() for event in step.get("events", ())
+        )
+        self._ledger.look(found, how != "killed", calm)
         if step["do"] == "verify" and (Store.exists(stage.store)):
             said = {note["found"] for note in found if "found" in note}
             if said != damaged:

@@ -192,7 +192,7 @@ def night(process: Process, step: dict[str, Any]) -> None:
     planned_s = sum(request.plan.seconds(trial) for trial in request.plan)
     host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
     # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces
-    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.1
+    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.2
     disturbed = any({"lie", "suspend"} & event.keys() for event in step.get("events", ()))
     witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or disturbed))
     witness.install()
@@ -225,6 +225,9 @@ def night(process: Process, step: dict[str, Any]) -> None:
         while trials:
             session.collector.take(trials)
             trials = session.more() if step.get("most") is None else []
+        left = request.due_trials(store.campaign(request.campaign))
+        if left and step.get("most") is None and not control.open_requests(store):
+            witness.wrong("a night takes all that is due", f"{[each.id for each in left]} are left")
 
 
 def _wait(host: Host, seconds: float) -> None:

@@ -30,7 +30,7 @@ def _device(rng: random.Random, *but: str) -> dict[str, Any]:
 FAULTS: dict[str, Draw] = {
     "arm_protective_stop": lambda rng: {},
     "arm_off_path": lambda rng: {
-        "mm": rng.choice([0.3, 0.5, 3, 10]),
+        "mm": rng.choice([0.3, 1, 3, 10]),
         "seconds": rng.choice([0.3, 2]),
     },
     "frames_lost": lambda rng: {"count": rng.choice([1, 5])},
@@ -62,12 +62,18 @@ FAULTS: dict[str, Draw] = {
 }
 """Parameters of each kind of `rigs.core.faults` that a rig file may name."""
 COMMIT = ("=1/record.json", "=1/checksums.json", "=1/.cause.json", "/trials", "/trials")
-NAMES = (
+NIGHT = (
     *("=1/data.h5", "=1/provenance.json", "=1/journal.jsonl", "/skipped.json", "/control"),
     *("/incoming", "/quarantine", "/campaign.json", "/bench", "/store.json", "/rig.yaml"),
-    *(".done.json", "/log", "/objects", "/remote/", "/pulled/"),
 )
-"""Parts of paths, each of which a kill or a power cut may wait for: of a commit, and others."""
+ASKED = ("/control", ".done.json", "/skipped.json", "/quarantine", "/log", "=1/.cause.json")
+NAMES = {
+    "night": (COMMIT, NIGHT),
+    "push": (("/objects", "/objects", "/remote/"),),
+    "pull": (("/pulled/", "=1/data.h5", "/incoming", "/trials"),),
+    "between": (ASKED,),
+}
+"""Parts of paths, each of which a kill or a power cut of a step may wait for."""
 CALLS = {"write": 9.5, "fsync": 5.5, "rename": 3.3, "any": 9.7}
 """Calls of a night that change a file, by kind: powers of two."""
 WHOLE_TRIALS = {"plate_stuck", "papilla_sticky", "skin_wear", "plate_spot", "arm_ramp"}
@@ -88,10 +94,13 @@ def draw(seed: int) -> Story:
     rng = random.Random(seed)
     rig = _rig(rng)
     # with a force limit, which is looked at all the time, a second costs six times as much
-    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 0.5, 5, 60])
-    story = {"seed": seed, "protocol": _protocol(rng, hold_s), "rig": rig}
+    hold_s = rng.choice([0.5, 5] if "force" in rig["limits"] else [0.5, 5, 60, 240])
+    events = "events" in rig.get("cameras", ["events"])
+    if hold_s > 5:
+        rig["poll"] = "1 s"
+    story = {"seed": seed, "protocol": _protocol(rng, hold_s, events), "rig": rig}
     trials = len(story["protocol"]["collection"]["factors"]["direction"]["values"])
-    kinds = [*STEPS]
+    kinds = [kind for kind in STEPS if events or kind not in OF_EVENTS]
     steps: list[Step] = []
     for number in range(rng.randint(8, 14)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
@@ -106,7 +115,7 @@ def draw(seed: int) -> Story:
     return {**story, "steps": steps}
 
 
-def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
+def _protocol(rng: random.Random, hold_s: float, events: bool) -> dict[str, Any]:
     data = protocol(rng.randint(4, 9))
     data["name"] = "storm"
     collection = data["collection"]
@@ -124,7 +133,7 @@ def _protocol(rng: random.Random, hold_s: float) -> dict[str, Any]:
     rezero = {"every": rng.choice([3, 7]), "speed": "0.5 mm/s", "search": "0.5 mm"}
     both = {"warm_up": warm_up, "rezero": rezero}
     collection["maintenance"] = rng.choice([{}, both, {"rezero": rezero}])
-    if rng.random() < 0.4:
+    if events and rng.random() < 0.4:
         condition = {name: factors[name]["values"][0] for name in ("depth", "speed", "direction")}
         collection["references"] = {"every": 2, "condition": condition}
         collection["gates"]["reference"] = {"event_rate": rng.choice(["20 %", "60 %"])}
@@ -146,6 +155,8 @@ def _rig(rng: random.Random) -> dict[str, Any]:
         rig["timing"]["frames"] = rng.choice(grades)
     if rng.random() < 0.15:
         rig["timing"]["arm"] = "host time"
+    if rng.random() < 0.4:
+        rig["cameras"] = [rng.choice(["events", "frames", "frames"])]
     if rng.random() < 0.4:
         delay = {"shortest_us": 0, "longest_us": 4000}
         rig["timing"]["force"] = {"grade": "host time", "delay": delay}
@@ -195,14 +206,14 @@ def _faults(rng: random.Random, story: Story, trials: int = 4) -> list[dict[str,
     return found
 
 
-def _weather(rng: random.Random, share: float = 0.45) -> dict[str, Any]:
+def _weather(rng: random.Random, step: str, share: float = 0.45) -> dict[str, Any]:
     if rng.random() > share:
         return {}
     kind = rng.choice([*CALLS])
     kill = {"kind": kind, "at": round(2 ** rng.uniform(0, CALLS[kind]))}
     cut: Step = {"at": round(2 ** rng.uniform(2, CALLS["any"]))}
     if rng.random() < 0.7:  # at one of few calls, which would be met seldom among all
-        name = rng.choice(rng.choice([COMMIT, NAMES]))
+        name = rng.choice(rng.choice(NAMES[step]))
         kill = {"kind": "any", "at": round(2 ** rng.uniform(0, 3)), "name": name}
         cut = {"at": kill["at"], "name": kill["name"]}
     full = {"room": round(2 ** rng.uniform(8, 21)), "errno": rng.choice([28, 28, 5])}
@@ -252,7 +263,7 @@ def _lie(rng: random.Random, story: Story) -> Step:
 
 
 def _night(rng: random.Random, story: Story, trials: int) -> Step:
-    most = rng.choice([None, 1, 2, 2, 3])  # so that later nights have trials left
+    most = rng.choice([None, None, 1, 2, 2, 3])  # so that later nights have trials left
     night_s = (most or trials) * _trial_s(story)
     events = [_event(rng, story, trials, night_s) for _ in range(rng.choice([0, 1, 2, 3, 4]))]
     for event in [each for each in events if each.get("ask") == "pause"]:
@@ -265,7 +276,7 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
         "events": sorted(events, key=lambda event: event["at_s"]),
         "most": most,
         **window,
-        **_weather(rng),
+        **_weather(rng, "night"),
     }
 
 
@@ -275,9 +286,10 @@ def _damage(rng: random.Random, story: Story, trials: int) -> Step:
     return {"trial": rng.randrange(trials), "where": where, "how": how}
 
 
-def _copy(rng: random.Random, story: Story, trials: int) -> Step:
-    step = {"fails": rng.choice([0, 0, 2, 3, 5, 9]), "short": rng.random() < 0.3}
-    return {**step, "check": rng.random() < 0.2, **_weather(rng)}
+def _copy(rng: random.Random, kind: str) -> Step:
+    fails = rng.choice([0, round(2 ** rng.uniform(1, 7))])  # at any of its calls
+    step = {"fails": fails, "short": rng.random() < 0.3}
+    return {**step, "check": rng.random() < 0.2, **_weather(rng, kind)}
 
 
 def _record(rng: random.Random, story: Story, trials: int) -> Step:
@@ -299,7 +311,11 @@ def _react(rng: random.Random, story: Story, trials: int) -> Step:
 
 
 def _between(rng: random.Random, story: Story, trials: int) -> Step:
-    return {**_ask(rng, story, trials), **_weather(rng, 0.2)}
+    return {**_ask(rng, story, trials), **_weather(rng, "between", 0.2)}
+
+
+def _note(rng: random.Random, story: Story, trials: int) -> Step:
+    return {"skin": rng.choice(["2", "3"]), **_weather(rng, "between", 0.2)}
 
 
 def _probe(rng: random.Random, story: Story, trials: int) -> Step:
@@ -324,20 +340,22 @@ def _serve(rng: random.Random, story: Story, trials: int) -> Step:
 STEPS: dict[str, tuple[float, Callable[[random.Random, Story, int], Step]]] = {
     "night": (12, _night),
     "ask": (2, _between),
-    "log": (0.7, lambda rng, story, trials: {"skin": rng.choice(["2", "3"]), **_weather(rng, 0.2)}),
+    "log": (0.7, _note),
     "verify": (0.5, lambda rng, story, trials: {"quarantine": rng.random() < 0.5}),
     "damage": (1, _damage),
-    "import": (0.5, lambda rng, story, trials: _weather(rng)),
-    "push": (1.5, _copy),
-    "pull": (1.5, _copy),
+    "import": (0.5, lambda rng, story, trials: _weather(rng, "pull")),
+    "push": (1.5, lambda rng, story, trials: _copy(rng, "push")),
+    "pull": (1.5, lambda rng, story, trials: _copy(rng, "pull")),
     "serve": (1, _serve),
     "record": (0.4, _record),
     "carry": (0.4, _carry),
     "react": (0.3, _react),
     "probe": (0.6, _probe),
-    "alert": (0.4, _serve),
+    "alert": (1, _serve),
 }
 """Kinds of steps: how often they are drawn, and what draws their particulars."""
+OF_EVENTS = {"carry", "react"}
+"""Kinds of steps that a rig without an event camera does not have."""
 FOLLOWS = {
     "night": ("night", "night", "verify", "damage", "push", "ask"),
     "push": ("pull", "pull", "push", "damage", "night", "night"),

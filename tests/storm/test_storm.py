@@ -35,7 +35,7 @@ def test_every_fault_that_a_rig_file_may_name_is_part_of_the_storm() -> None:
 
 
 def test_every_kind_of_step_is_drawn() -> None:
-    drawn = {step["do"] for seed in range(40) for step in draw(seed)["steps"]}
+    drawn = {step["do"] for seed in range(100) for step in draw(seed)["steps"]}
     assert drawn == {*STEPS}
 
 

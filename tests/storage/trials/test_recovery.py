@@ -42,7 +42,9 @@ def damage(folder: Path, how: str) -> None:
 @pytest.mark.parametrize("how", ["", "-checksums.json", "~checksums.json"])
 def test_killed_commit_is_completed(where: Campaign, tmp_path: Path, how: str) -> None:
     whole = commit(where, "u")
-    damage(killed(where), how)
+    damage(folder := killed(where), how)
+    for path in folder.iterdir():
+        path.chmod(0o644)  # as it is until all are written
     (problem,) = verify(Store.open(tmp_path / "s"))
     assert problem.kind == "unfinished"
     assert problem.path.endswith("incoming/t")
@@ -50,6 +52,8 @@ def test_killed_commit_is_completed(where: Campaign, tmp_path: Path, how: str) -
     assert where.sweep() == 0
     assert verify(Store.open(tmp_path / "s")) == []
     assert where.committed() == {"t", "u"}
+    for path in (where.folder / "trials" / "t").iterdir():
+        assert path.stat().st_mode & 0o222 == 0
     for name in ("data.h5", "frames.mkv"):
         assert (where.folder / "trials" / "t" / name).read_bytes() == (whole / name).read_bytes()
 
