@@ -20,11 +20,11 @@ from sliplab.analysis.clocks.synchronise import (
     synchronise,
 )
 from sliplab.plugins.record.pulsed import clocks_by_pulses
+from sliplab.plugins.record.shared_clock import SHARED, explained
 from sliplab.plugins.record.sources import (
     CLOCK_STREAM,
     FIRST_CAMERAS,
     HOST,
-    SHARED,
     TIMING,
     SourceAbout,
 )
@@ -122,7 +122,9 @@ def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int
     fitted = synchronise(streams, Timing(arm="host time"), 1, with_events=False)
     for name in timed:
         if name not in fitted.devices:
-            result.refused[name] = fitted.refused[name]
+            shared = timed[name].clock in SHARED
+            why = explained(timed[name].clock, inputs[name].reads) if shared else ""
+            result.refused[name] = why or fitted.refused[name]
             continue
         record, error = fitted.devices[name].record(), errors.get(name, 0)
         source = timed[name]

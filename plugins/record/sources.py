@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
+from sliplab.plugins.record.shared_clock import SHARED, doubt, now_ns
 from sliplab.plugins.record.table import rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
@@ -53,8 +54,6 @@ from sliplab.storage.streams import (
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"
 """How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
 by the timing that its file says."""
-SHARED = {"ptp": time.CLOCK_TAI, "utc": time.CLOCK_REALTIME}
-"""Clocks that devices and the host share, as the host has them: by PTP (TAI), or UTC."""
 _SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
 FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
 CLOCK_STREAM = "{}_clock"
@@ -77,6 +76,8 @@ class SourceAbout(BaseModel):
     clock: str
     uncertainty_ns: float | None = None
     """Of stamps of the host's clock or of a shared one, where it is stated."""
+    doubt: str = ""
+    """What is to be said of the clock that it shares, see `plugins.record.shared_clock`."""
 
 
 @dataclass
@@ -113,7 +114,10 @@ class Source:
     def about(self) -> SourceAbout:
         """What a trial's record says of it."""
         return SourceAbout(
-            record=self.stream.about, clock=self.clock, uncertainty_ns=self.uncertainty_ns
+            record=self.stream.about,
+            clock=self.clock,
+            uncertainty_ns=self.uncertainty_ns,
+            doubt=doubt(self.clock),
         )
 
     def expected(self) -> dict[str, tuple[Chunk, ...]]:
@@ -174,7 +178,7 @@ class Source:
             found.append((seen.newest_ns, before - error, now + error, 0))
         if self.clock in SHARED:
             before = time.monotonic_ns()
-            t_ns = time.clock_gettime_ns(SHARED[self.clock])
+            t_ns = now_ns(self.clock)
             found.append((t_ns, before, time.monotonic_ns(), 0))
         columns = np.array(found, np.int64).reshape(-1, 4).T
         return rows(CLOCK, "", dict(zip(CLOCK.columns, columns, strict=True)))

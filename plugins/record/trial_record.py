@@ -88,6 +88,7 @@ def make_record(
     inside = [mark for mark in marks if span[0] <= mark.t_ns <= span[1]]
     notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
     notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
+    notes += [f"{name}: {each.doubt}" for name, each in present.items() if each.doubt]
     notes += clocks.common
     notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
     about: dict[str, Any] = {

@@ -13,7 +13,8 @@ import pytest
 
 from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
-from sliplab.plugins.record.sources import SHARED, columns, push
+from sliplab.plugins.record.shared_clock import SHARED, now_ns
+from sliplab.plugins.record.sources import columns, push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.recording import Recording
@@ -57,14 +58,19 @@ AT_ONCE = {
 """Stamps more than a day from the host's clock are errors of `push`."""
 
 
+def source_ns(clock: str) -> int:
+    """A right clock of a source."""
+    return now_ns(clock) if clock in SHARED else time.monotonic_ns()
+
+
 def pushed(trial_push: Callable[..., None], clock: str) -> dict[str, list[int]]:
     """Push the rows of all streams in real time; return the stamps that were taken, by stream."""
     taken: dict[str, list[int]] = {name: [] for name in STAMPS}
-    first = time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC))
+    first = source_ns(clock)
     for k in range(STEPS):
         threading.Event().wait(STEP_S)  # the sensor's period
         for name, stamp in STAMPS.items():
-            t_ns = stamp(time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC)), first, k)
+            t_ns = stamp(source_ns(clock), first, k)
             try:
                 trial_push(name, t_ns, float(k))
             except InputError:
@@ -161,11 +167,11 @@ def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
 ) -> None:
     """A file of events is in the order of time, so that what falls back cannot be stored."""
     source = push("events", events_px=(64, 48), clock="ptp", uncertainty_ms=STATED_MS)
-    first = time.clock_gettime_ns(SHARED["ptp"])
+    first = now_ns("ptp")
     with record([source], tmp_path, "stamps") as recorder, recorder.trial() as trial:
         for k in range(STEPS):
             threading.Event().wait(STEP_S)  # the camera's period
-            t_ns = STAMPS[wrong](time.clock_gettime_ns(SHARED["ptp"]), first, k)
+            t_ns = STAMPS[wrong](now_ns("ptp"), first, k)
             trial.push("events", t_ns // 1000, 1, 2, 1)
     assert verify(str(tmp_path))["ok"]
     (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
