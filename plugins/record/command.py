@@ -172,6 +172,13 @@ class _Session:
                 self.lost[name] = self.lost.get(name, 0) + count
             self._line("")
         console.say(f"trial {trial.id} is committed")
+        about = None if trial.record is None else trial.record.imported
+        if about is not None:
+            for text in (
+                *(f"{count} {what}" for what, count in about.dropped.items()),
+                *about.warnings,
+            ):
+                console.say(f"  {text}")
 
     def _answer(self, key: str) -> bool:
         """Do what a key asks for; return False to quit."""

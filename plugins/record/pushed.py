@@ -15,6 +15,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
+    I64,
     SCALAR,
     Chunk,
     EventChunk,
@@ -27,8 +28,7 @@ MOST_BYTES = 256 * 10**6
 READ_BYTES = 16 * 10**6
 """Data that are read at once, so that a program that pushes too fast costs no more memory."""
 LATE_NS = 500_000_000
-"""Rows that are older than newer ones by less are of a slow thread; by more, the clock fell back.
-"""
+"""Rows wait so long for older ones, of a slow thread; ones that are older by more fell back."""
 _DAY_NS = 86_400 * 10**9
 
 
@@ -63,8 +63,10 @@ class PushedStream:
         self._reset()
 
     def _reset(self) -> None:
-        self._parts: deque[Chunk] = deque()
+        self._parts: deque[tuple[int, Chunk]] = deque()  # and when they were pushed
         self._bytes = self._number = 0
+        self._newest: int | None = None
+        self._unordered = self._fell = False
         self._last: int | None = None
         self.lost = self.late = 0
 
@@ -124,38 +126,64 @@ class PushedStream:
             if isinstance(chunk, FrameChunk):  # numbered in their order
                 chunk.number[:] += self._number
                 self._number += len(chunk)
-            self._parts.append(chunk)
+            if self.kind is not None and len(chunk):
+                self._note_order(chunk.times)
+            self._parts.append((now, chunk))
             self._bytes += size
 
-    def read(self) -> Chunk:
-        """Return rows since the last call, in order of time; late ones are left out.
+    def _note_order(self, times: I64) -> None:
+        first = int(times[0]) if self._newest is None else self._newest
+        newest = np.maximum.accumulate(np.maximum(times, first))
+        behind = int((newest - times).max())
+        self._newest = int(newest[-1])
+        self._unordered |= behind > 0
+        self._fell |= behind >= LATE_NS
 
-        Numbers of a clock that fell back stay as they were pushed: its fit refuses them.
+    def read(self) -> Chunk:
+        """Return rows since the last call, in order of time.
+
+        Numbers wait for `LATE_NS`. Those of a clock that fell back stay as they were pushed: its
+        fit refuses them. Events and frames that are late are left out, and counted.
         """
         parts: list[Chunk] = []
         size = 0
         with self._lock:
-            while self._parts and size < READ_BYTES:
-                parts.append(self._parts.popleft())
+            ripe = time.monotonic_ns()
+            if self.kind is not None and self._running and not self._fell:
+                ripe -= LATE_NS
+            while self._parts and size < READ_BYTES and self._parts[0][0] <= ripe:
+                parts.append(self._parts.popleft()[1])
                 size += _bytes(parts[-1])
+            if parts and self._unordered and not self._fell:
+                parts += self._older(max(int(part.times.max(initial=-MOST_NS)) for part in parts))
+                size = sum(map(_bytes, parts))
             self._bytes -= size
         chunk = type(parts[0]).concatenate(parts) if parts else self.empty()
-        if not len(chunk):
-            return chunk
-        last = int(chunk.times[0]) if self._last is None else self._last
-        newest = np.maximum.accumulate(np.maximum(chunk.times, last))
-        if self.kind is not None and int((newest - chunk.times).max()) >= LATE_NS:
-            self._last = int(chunk.times[-1])
+        if self._fell or not len(chunk):
             return chunk
         if np.any(chunk.times[1:] < chunk.times[:-1]):
             chunk = chunk[np.argsort(chunk.times, kind="stable")]
-        if self._last is not None and chunk.times[0] < self._last:
+        if self.kind is None and self._last is not None and chunk.times[0] < self._last:
             good = chunk.times >= self._last
             self.late += int((~good).sum())
             chunk = chunk[good]
         if len(chunk):
             self._last = int(chunk.times[-1])
         return chunk
+
+    def _older(self, newest: int) -> list[Chunk]:
+        """Remove and return the rows that wait and are older than a time."""
+        found: list[Chunk] = []
+        left: deque[tuple[int, Chunk]] = deque()
+        for at, part in self._parts:
+            old = part.times < newest
+            if old.any():
+                found.append(part[old])
+                part = part[~old]
+            if len(part):
+                left.append((at, part))
+        self._parts = left
+        return found
 
     @property
     def waiting(self) -> bool:

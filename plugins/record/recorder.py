@@ -35,7 +35,7 @@ from sliplab.rigs.rig_lock import lock_file, locked
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import safe_name, write_json
 from sliplab.storage.interrupts import uninterrupted
-from sliplab.storage.schema.trial import Mark, Provenance
+from sliplab.storage.schema.trial import Mark, Provenance, TrialRecord
 from sliplab.storage.streams import FRAMES_KIND, Chunk
 from sliplab.storage.trials.prefix_journal import BEGUN
 from sliplab.storage.trials.store import Campaign, Store
@@ -49,6 +49,8 @@ TAIL_S = 0.1
 """Time for which streams are read after the end of a trial: data are on their way, s."""
 START_S, END_S = 60.0, 600.0
 """Longest time for devices to start; and for a trial to end, which fits clocks and seals files."""
+LOST = ("lost", "late", "overflowed", "dropped", "malformed")
+"""Counts of a device of rows that are not recorded."""
 _FRAME_RATE = 100
 """Time base of videos only."""
 _UNITS = {each.symbol.lower().replace("/", "_"): each.symbol for each in TABLE}
@@ -177,18 +179,21 @@ class RecordedTrial:
     Attributes:
         id: its id in the campaign, once it has begun.
         faults: why streams have ended, by name.
+        record: once it is committed.
     """
 
     def __init__(self, recorder: Recorder, condition: dict[str, str]) -> None:
         self._recorder, self._condition = recorder, condition
         self.id = ""
         self.faults: dict[str, str] = {}
+        self.record: TrialRecord | None = None
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._began, self._end = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._ended_by = ""
         self._lock = threading.Lock()
         self._marks: list[Mark] = []
+        self._drained = False
         self.begin_ns = self._end_ns = 0
         self.bytes_written = 0
 
@@ -261,12 +266,17 @@ class RecordedTrial:
         Args:
             t_ns: on the host's clock (``time.monotonic_ns()``); None is now.
             uncertainty_ms: bound of its error; None where it is unknown.
+
+        Raises:
+            InputError: the name. RuntimeError: the trial has ended.
         """
         if not name or not name.isprintable() or len(name) > 100:
             raise InputError("mark", "", name, "must be printable text of 100 characters at most")
         at = time.monotonic_ns() if t_ns is None else int(t_ns)
         error = None if uncertainty_ms is None else uncertainty_ms * 1e6
         with self._lock:
+            if self._drained:
+                raise RuntimeError(f"mark '{name}': the trial has ended")
             self._marks.append(Mark(name=name, t_ns=at, uncertainty_ns=error))
 
     def rows(self) -> dict[str, int]:
@@ -278,10 +288,16 @@ class RecordedTrial:
         found = {}
         for source in self._recorder.sources:
             counts = (source.stream.describe() or {}).get("counts", {})
-            lost = sum(int(counts.get(key, 0)) for key in ("lost", "late", "overflowed", "dropped"))
-            if lost:
+            if lost := sum(int(counts.get(key, 0)) for key in LOST):
                 found[source.name] = lost
         return found
+
+    def _note(self, writer: TrialWriter, begun: BegunTrial, changed: bool = False) -> None:
+        """Write down how the trial was begun if that has changed, or what is lost."""
+        dropped = {f"rows of {name} that were lost": n for name, n in self.lost().items()}
+        if changed or dropped != begun.dropped:
+            begun.dropped = dropped
+            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
 
     def _wait(self, event: threading.Event, seconds: float, what: str) -> None:
         if not event.wait(seconds):
@@ -345,13 +361,14 @@ class RecordedTrial:
             for source in sources:
                 source.start()
             self.begin_ns = begun.begin_ns = time.monotonic_ns()
-            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
+            self._note(writer, begun, changed=True)
             self._began.set()
             noted = time.monotonic()
             while not self._end.wait(POLL_S):
                 self._drain(writer, begun)
                 if time.monotonic() - noted >= MARK_S:
                     writer.mark()
+                    self._note(writer, begun)
                     self.bytes_written = sum(p.stat().st_size for p in writer.folder.iterdir())
                     noted = time.monotonic()
             tail = time.monotonic() + TAIL_S
@@ -375,9 +392,10 @@ class RecordedTrial:
                 source.fault = self.faults[source.name] = str(error)
         with self._lock:
             marks, self._marks = self._marks, []
+            self._drained = last
         if marks:
             begun.marks += marks
-            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
+            self._note(writer, begun, changed=True)
 
     def _commit(self, writer: TrialWriter, begun: BegunTrial) -> None:
         """Fit the clocks, and commit the trial."""
@@ -385,11 +403,9 @@ class RecordedTrial:
         notes = [f"ended by {self._ended_by}"] if self._ended_by else []
         notes += [f"{fault}; the stream ended there" for fault in self.faults.values()]
         devices = {s.name: about for s in sources if (about := s.stream.describe()) is not None}
-        dropped = {f"rows of {name} that were lost": n for name, n in self.lost().items()}
+        self._note(writer, begun)
         folder = writer.seal()
-        record = make_record(
-            folder, begun, self._end_ns, tuple(notes), dropped=dropped, devices=devices
-        )
+        record = make_record(folder, begun, self._end_ns, tuple(notes), devices=devices)
         provenance = Provenance(
             started=begun.started,
             ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -399,6 +415,7 @@ class RecordedTrial:
             versions=installed_versions(RECORDING),
         )
         writer.commit(record, provenance)
+        self.record = record
 
 
 def record(

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 SHARED = {"ptp": "TAI", "utc": "UTC"}
 """Time scale of each declaration."""
 TAI_S = 37
-"""TAI - UTC since 1 January 2017 (IERS, Bulletin C 52), where the system has no table of its own."""
+"""TAI - UTC since 2017 (IERS, Bulletin C 52), where the system has no table of its own, seconds."""
 GPS_S = 19
-"""TAI - GPS time (IS-GPS-200)."""
+"""TAI - GPS time (IS-GPS-200), seconds."""
 TABLE = Path("/usr/share/zoneinfo/leap-seconds.list")
 _NTP_S = 2_208_988_800
 """From 1900, whence the table counts, to 1970, seconds."""
@@ -33,7 +33,7 @@ _APART_NS = BILLION // 2
 
 def kernel_s() -> int:
     """Return TAI - UTC as the host's kernel has it, seconds; 0 where nothing has set it."""
-    return round(time.clock_gettime(time.CLOCK_TAI) - time.time())
+    return round(time.clock_gettime(time.CLOCK_TAI) - time.clock_gettime(time.CLOCK_REALTIME))
 
 
 def tai_s() -> int:
@@ -44,9 +44,10 @@ def tai_s() -> int:
 
 @cache
 def _by_table_s() -> int:
+    now_s = time.time_ns() // BILLION + _NTP_S
     try:
         rows = [line.split() for line in TABLE.read_text("ascii").splitlines() if line[:1] != "#"]
-        past = [int(row[1]) for row in rows if row and int(row[0]) - _NTP_S <= time.time()]
+        past = [int(row[1]) for row in rows if row and int(row[0]) <= now_s]
     except (OSError, ValueError, IndexError):
         past = []
     return max([TAI_S, *past[-1:]])

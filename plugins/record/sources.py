@@ -173,9 +173,10 @@ class Source:
         if seen.newest_ns is not None:
             timing = self.stream.about.timing or StreamTiming()
             error = round(self.uncertainty_ns or 0)
-            # the newest row came after the call before, and was sent not longer before than its way
-            before = self._drained_ns - round(timing.delay.longest_us * 1000)
-            found.append((seen.newest_ns, before - error, now + error, 0))
+            # events have no time of arrival: they came after the call before
+            came = (self._drained_ns, now) if seen.host_ns is None else (seen.host_ns,) * 2
+            before = came[0] - round(timing.delay.longest_us * 1000)
+            found.append((seen.newest_ns, before - error, came[1] + error, 0))
         if self.clock in SHARED:
             before = time.monotonic_ns()
             t_ns = now_ns(self.clock)
@@ -185,11 +186,12 @@ class Source:
 
 
 class _Newest:
-    """A sink that counts a source's rows, and notes the time of its newest."""
+    """A sink that counts a source's rows, and notes the time of its newest, and its arrival's."""
 
     def __init__(self, sink: Sink, source: Source) -> None:
         self._sink, self._source = sink, source
         self.newest_ns: int | None = None
+        self.host_ns: int | None = None
 
     def add(self, device: str, chunk: Chunk) -> None:
         if not isinstance(chunk, (PulseChunk, ClockReads)):
@@ -197,6 +199,8 @@ class _Newest:
             if len(chunk):
                 unit = 1000 if isinstance(chunk, EventChunk) else 1
                 self.newest_ns = int(chunk.times[-1]) * unit
+                if (host := chunk.KIND.columns.get("host")) is not None:
+                    self.host_ns = int(getattr(chunk, host.field)[-1])
         self._sink.add(device, chunk)
 
 

@@ -62,7 +62,7 @@ def test_only_stamps_of_the_declared_scale_are_believed(
 
 
 def test_a_further_leap_second_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    leap, now = tmp_path / "leap-seconds.list", int(time.time()) + 2_208_988_800
+    leap, now = tmp_path / "leap-seconds.list", time.time_ns() // S + 2_208_988_800
     leap.write_text(f"3692217600 37\n{now - 9} 38\n{now + 900} 39\n")
     monkeypatch.setattr(shared_clock, "TABLE", leap)
     monkeypatch.setattr(shared_clock, "kernel_s", lambda: 0)
