@@ -25,8 +25,8 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
-from sliplab.plugins.record.sources import Source, opened
-from sliplab.plugins.record.tapped import check_common
+from sliplab.plugins.record.sources import READS, Source, opened
+from sliplab.plugins.record.tapped import check_common, check_pulses
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
@@ -112,6 +112,8 @@ class Recorder:
             for key, names in (("tap", self._tap), ("pulses", self._pulses)):
                 if names is not None:
                     check_common(key, names, self.sources)
+            if self._pulses is not None and all(s.clock != READS for s in self.sources):
+                check_pulses(self._pulses, self.sources)
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
@@ -126,6 +128,8 @@ class Recorder:
             self.salvaged = salvage_campaign(self.campaign)
             for source in self.sources:
                 source.stream.connect()
+            if self._pulses is not None:  # columns of LSL are known now
+                check_pulses(self._pulses, self.sources)
             self._undo = undo.pop_all()
         return self
 

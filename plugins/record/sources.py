@@ -18,7 +18,7 @@ from sliplab.plugins.record.shared_clock import SHARED, doubt, now_ns
 from sliplab.plugins.record.table import rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.timing import WIRED, StreamGrade, StreamTiming
+from sliplab.protocols.timing import WIRED, Delay, StreamGrade, StreamTiming
 from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
 from sliplab.rigs.build import driven_stream, taught_frame
 from sliplab.rigs.core.device_stream import DeviceStream
@@ -57,6 +57,7 @@ by the timing that its file says."""
 _SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
 FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
 CLOCK_STREAM = "{}_clock"
+MOST_DELAY_MS = 10_000.0
 
 
 class StreamsFile(StrictModel):
@@ -123,8 +124,13 @@ class Source:
     def expected(self) -> dict[str, tuple[Chunk, ...]]:
         """Return empty chunks of what may come, by stream; the device is connected."""
         clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
-        read = self.clock == READS or self.clock in SHARED
-        return {self.name: self._chunks()} | (clock if read else {})
+        return {self.name: self._chunks()} | (clock if self._clock_is_read else {})
+
+    @property
+    def _clock_is_read(self) -> bool:
+        """Whether readings of its clock are stored; arrivals of events have no other place."""
+        pushed = self.clock == HOST and self.stream.about.kind == EVENTS_KIND
+        return self.clock == READS or self.clock in SHARED or pushed
 
     def _chunks(self) -> tuple[Chunk, ...]:
         kind, unit = self.stream.about.kind, self.stream.about.unit or ""
@@ -160,7 +166,7 @@ class Source:
         if last:
             self.stream.finish(seen)
         now = time.monotonic_ns()
-        if self.clock == READS or self.clock in SHARED:
+        if self._clock_is_read:
             sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
         self._drained_ns = now
 
@@ -212,6 +218,7 @@ def push(
     frames_px: tuple[int, int] | None = None,
     clock: str = "host",
     uncertainty_ms: float | None = None,
+    delay_ms: float = 50.0,
 ) -> Source:
     """Declare a stream that the program pushes by `RecordedTrial.push`.
 
@@ -224,6 +231,7 @@ def push(
             which the host has too, by PTP or NTP: refused where the times of pushing contradict it.
         uncertainty_ms: bound of the error of times of the host's clock, None where it is unknown;
             of ``ptp`` and ``utc`` it must be stated.
+        delay_ms: longest time from a row's time to its push; of times of the host's clock any.
 
     Raises:
         InputError: an argument.
@@ -238,6 +246,9 @@ def push(
         raise InputError(name, "uncertainty_ms", uncertainty_ms, right)
     if clock in SHARED and uncertainty_ms is None:
         raise InputError(name, "uncertainty_ms", None, f"is needed with clock={clock!r}")
+    if not (_is_bound(delay_ms) and 0 < delay_ms <= MOST_DELAY_MS):
+        right = f"must be a number of milliseconds, above 0 and up to {MOST_DELAY_MS:g}"
+        raise InputError(name, "delay_ms", delay_ms, right)
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
     _check_name(name, kind)
     size = events_px or frames_px
@@ -249,9 +260,11 @@ def push(
         told["unit"] = device.unit
     if kind == FRAMES_KIND:
         told["mid_exposure_ns"] = 0
-    if clock == "own":
+    if clock != "host":
         grade: StreamGrade = "host arrival" if kind == FRAMES_KIND else "host time"
-        told["timing"] = StreamTiming(grade=grade)
+        delay = Delay(shortest_us=0, longest_us=1000 * delay_ms)
+        told["timing"] = StreamTiming(grade=grade, delay=delay)
+    if clock == "own":
         how = READS if kind == EVENTS_KIND else TIMING
     else:
         how = clock if clock in SHARED else HOST
