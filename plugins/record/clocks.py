@@ -177,7 +177,7 @@ def _wrong_times(
     slope, start = np.polyfit(seconds := (came - came[0]) / 1e9, late_s, 1)
     gained_s = slope * seconds[-1]
     rest_s = float(np.std(late_s - start - slope * seconds))
-    if abs(gained_s) > max(DRIFT_S, 10 * rest_s):
+    if abs(gained_s) > max(DRIFT_S, 8 * rest_s):
         slow = "fall behind their arrival", "slow, or the program pushes ever later"
         what, why = (
             slow if slope > 0 else ("run ahead of their arrival", "fast, or of another unit")
