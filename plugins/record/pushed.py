@@ -29,6 +29,7 @@ READ_BYTES = 16 * 10**6
 """Data that are read at once, so that a program that pushes too fast costs no more memory."""
 LATE_NS = 500_000_000
 """Rows wait so long for older ones, of a slow thread; ones that are older by more fell back."""
+_WHOLE = 2**53
 _DAY_NS = 86_400 * 10**9
 
 
@@ -216,9 +217,9 @@ class PushedStream:
         if len(values) > len(expected) or set(given) != set(expected):
             found = [*given, *map(str, values[len(expected) :])]
             raise InputError(self._name, "", found, f"must be the columns {', '.join(expected)}")
-        arrays = {name: np.atleast_1d(np.asarray(value)) for name, value in given.items()}
         if self._camera == FRAMES_KIND:
             return self._frames(times, now, np.asarray(given["images"]))
+        arrays = {name: self._numbers(name, value) for name, value in given.items()}
         if wrong := [name for name, each in arrays.items() if each.shape != times.shape]:
             text = f"must have one number for each of {len(times)} times"
             raise InputError(self._name, wrong[0], arrays[wrong[0]].shape, text)
@@ -229,6 +230,25 @@ class PushedStream:
         names = ("value",) if self.kind == SCALAR else self.columns
         by_name = dict(zip(names, (arrays[name] for name in self.columns), strict=True))
         return rows(self.kind, self.unit, {"t": times, "host": host, **by_name})
+
+    def _numbers(self, name: str, value: Any) -> Any:
+        """Return values of a column as an array of its own: the program may use theirs again."""
+        try:
+            found = np.atleast_1d(np.array(value))
+        except ValueError:  # lists of different lengths
+            found = np.empty(0, object)
+        if found.dtype.kind not in "biuf":
+            raise InputError(self._name, name, value, "must be a number, or numbers")
+        if (
+            found.dtype.kind in "iu"
+            and found.size
+            and max(-int(found.min()), int(found.max())) > _WHOLE
+        ):
+            text = "cannot be stored: float64 holds whole numbers up to 2**53; push it in two parts"
+            raise InputError(self._name, name, int(found[np.argmax(np.abs(found))]), text)
+        if self._camera == EVENTS_KIND and not np.array_equal(found, np.floor(found)):
+            raise InputError(self._name, name, value, "must be whole numbers")
+        return found
 
     def _events(self, times: Any, arrays: Mapping[str, Any]) -> EventChunk:
         assert self._size is not None

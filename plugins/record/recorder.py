@@ -10,9 +10,10 @@ from __future__ import annotations
 import re
 import shutil
 import socket
+import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,7 +26,8 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
-from sliplab.plugins.record.sources import READS, Source, opened
+from sliplab.plugins.record.sources import READS, Source, is_bound, opened
+from sliplab.plugins.record.table import MOST_NS
 from sliplab.plugins.record.tapped import check_common, check_pulses
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
@@ -151,7 +153,7 @@ class Recorder:
         """
         if self._running is not None:
             raise RuntimeError("a trial is being recorded; end it first")
-        return RecordedTrial(self, dict(level(name, value) for name, value in condition.items()))
+        return RecordedTrial(self, levels(condition))
 
     def _next_id(self) -> tuple[str, int]:
         known = {
@@ -163,13 +165,25 @@ class Recorder:
         return f"{number:06d}", number - 1
 
 
-def level(name: str, value: object) -> tuple[str, str]:
-    """Return a factor and its level as text. Raises InputError."""
+def levels(condition: Mapping[str, object]) -> dict[str, str]:
+    """Return the levels of a condition as text, by factor. Raises InputError."""
+    found: dict[str, str] = {}
+    for name, value in condition.items():
+        factor, text = _level(name, value)
+        if factor in found:
+            raise InputError("trial", name, value, f"gives the factor {factor} a second time")
+        found[factor] = text
+    return found
+
+
+def _level(name: str, value: object) -> tuple[str, str]:
+    if not name.isidentifier():
+        raise InputError("trial", name, value, "must have a name of letters, digits and _")
     if isinstance(value, bool) or not isinstance(value, (str, int, float, np.number)):
         raise InputError("trial", name, value, "must be text or a number")
     if isinstance(value, str):
         return name, _LEVEL.sub("_", value) or "_"
-    if not np.isfinite(value):
+    if not abs(value) <= sys.float_info.max:  # which NaN is not
         raise InputError("trial", name, value, "must be a finite number")
     for suffix, unit in _UNITS.items():
         if name.endswith(f"_{suffix}") and len(name) > len(suffix) + 1:
@@ -272,10 +286,19 @@ class RecordedTrial:
             uncertainty_ms: bound of its error; None where it is unknown.
 
         Raises:
-            InputError: the name. RuntimeError: the trial has ended.
+            InputError: an argument. RuntimeError: the trial has ended.
         """
         if not name or not name.isprintable() or len(name) > 100:
             raise InputError("mark", "", name, "must be printable text of 100 characters at most")
+        if t_ns is not None and (
+            isinstance(t_ns, bool)
+            or not isinstance(t_ns, (int, np.integer))
+            or abs(int(t_ns)) >= MOST_NS
+        ):
+            raise InputError("mark", "t_ns", t_ns, "must be whole ns, as time.monotonic_ns() gives")
+        if uncertainty_ms is not None and not is_bound(uncertainty_ms):
+            right = "must be a finite number of milliseconds, not negative"
+            raise InputError("mark", "uncertainty_ms", uncertainty_ms, right)
         at = time.monotonic_ns() if t_ns is None else int(t_ns)
         error = None if uncertainty_ms is None else uncertainty_ms * 1e6
         with self._lock:

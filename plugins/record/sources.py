@@ -91,6 +91,7 @@ class Source:
         locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
         fault: why it has ended within the trial; None while it runs.
         rows: that came in this trial.
+        used: a recorder has it.
     """
 
     stream: DeviceStream
@@ -99,6 +100,7 @@ class Source:
     locks: Mapping[str, str] = field(default_factory=dict)
     fault: str | None = None
     rows: int = 0
+    used: bool = False
     _drained_ns: int = 0
 
     @property
@@ -124,10 +126,10 @@ class Source:
     def expected(self) -> dict[str, tuple[Chunk, ...]]:
         """Return empty chunks of what may come, by stream; the device is connected."""
         clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
-        return {self.name: self._chunks()} | (clock if self._clock_is_read else {})
+        return {self.name: self._chunks()} | (clock if self.clock_is_read else {})
 
     @property
-    def _clock_is_read(self) -> bool:
+    def clock_is_read(self) -> bool:
         """Whether readings of its clock are stored; arrivals of events have no other place."""
         pushed = self.clock == HOST and self.stream.about.kind == EVENTS_KIND
         return self.clock == READS or self.clock in SHARED or pushed
@@ -166,7 +168,7 @@ class Source:
         if last:
             self.stream.finish(seen)
         now = time.monotonic_ns()
-        if self._clock_is_read:
+        if self.clock_is_read:
             sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
         self._drained_ns = now
 
@@ -241,12 +243,12 @@ def push(
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
     if clock not in {"host", "own", *SHARED}:
         raise InputError(name, "clock", clock, "must be host, own, ptp or utc")
-    if uncertainty_ms is not None and not _is_bound(uncertainty_ms):
+    if uncertainty_ms is not None and not is_bound(uncertainty_ms):
         right = "must be a finite number of milliseconds, not negative"
         raise InputError(name, "uncertainty_ms", uncertainty_ms, right)
     if clock in SHARED and uncertainty_ms is None:
         raise InputError(name, "uncertainty_ms", None, f"is needed with clock={clock!r}")
-    if not (_is_bound(delay_ms) and 0 < delay_ms <= MOST_DELAY_MS):
+    if not (is_bound(delay_ms) and 0 < delay_ms <= MOST_DELAY_MS):
         right = f"must be a number of milliseconds, above 0 and up to {MOST_DELAY_MS:g}"
         raise InputError(name, "delay_ms", delay_ms, right)
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
@@ -272,7 +274,7 @@ def push(
     return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
 
 
-def _is_bound(value: object) -> bool:
+def is_bound(value: object) -> bool:
     """Return whether a value is a finite number, not negative."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         return False
@@ -367,12 +369,22 @@ def opened(streams: Iterable[str | Path | Source], undo: ExitStack) -> list[Sour
     found: list[Source] = []
     for each in streams:
         for source in [each] if isinstance(each, Source) else _of_text(str(each)):
+            if source.used:
+                right = "is being recorded already; declare another stream"
+                raise InputError("streams", "", source.name, right)
+            source.used = True
+            undo.callback(setattr, source, "used", False)
             undo.callback(source.stream.close)
             if source.name in {other.name for other in found}:
                 raise InputError("streams", "", source.name, "is the name of two streams")
             found.append(source)
     if not found:
         raise InputError("streams", "", None, "names no stream")
+    for source in found:
+        clock = CLOCK_STREAM.format(source.name)
+        if source.clock_is_read and clock in {other.name for other in found}:
+            text = f"is the name of the readings of the clock of {source.name}; choose another one"
+            raise InputError("streams", "", clock, text)
     return found
 
 
