@@ -7,10 +7,10 @@ to a second before a crash is kept by the next recording (`plugins.record.salvag
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import socket
-import sys
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -183,7 +183,11 @@ def _level(name: str, value: object) -> tuple[str, str]:
         raise InputError("trial", name, value, "must be text or a number")
     if isinstance(value, str):
         return name, _LEVEL.sub("_", value) or "_"
-    if not abs(value) <= sys.float_info.max:  # which NaN is not
+    try:
+        finite = math.isfinite(float(value))
+    except OverflowError:
+        finite = False
+    if not finite:
         raise InputError("trial", name, value, "must be a finite number")
     for suffix, unit in _UNITS.items():
         if name.endswith(f"_{suffix}") and len(name) > len(suffix) + 1:

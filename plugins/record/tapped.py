@@ -32,7 +32,7 @@ class ContradictionError(NoMatchError):
     """Common events and arrivals put a clock in different places."""
 
 
-def check_common(key: str, names: tuple[str, ...], sources: Iterable[Source]) -> None:
+def check_common(key: str, names: tuple[str, ...] | str, sources: Iterable[Source]) -> None:
     """Raise InputError unless all of two or more sensors but the second have their own clock.
 
     Args:
