@@ -44,7 +44,7 @@ DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _CHUNK = 1000
 """Files of a folder."""
-_SAMPLES, _LEAST_SAMPLES = 100, 8
+_SAMPLES, _LEAST_SAMPLES = 64, 8
 """Frames of a data set, and of a trial at least, that are decoded for the statistics of levels."""
 _SAMPLE_PX = 150
 """Rows or columns of such a frame that are enough, as LeRobot has it."""
