@@ -35,7 +35,7 @@ def main() -> None:
             with guarded():
                 code = _run()
         except OutputLost as error:  # of output still to be written
-            code = _fail(str(error), exit_codes.FAILED)
+            code = exit_codes.UNREAD if error.unread else _fail(str(error), exit_codes.FAILED)
     except KeyboardInterrupt:
         code = _fail("interrupted", exit_codes.INTERRUPTED)
     except (ImportError, MemoryError, OSError, SystemError) as error:

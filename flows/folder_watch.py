@@ -19,6 +19,7 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.flows.running import console, stopping
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
+from sliplab.storage.files import safe_name
 from sliplab.storage.formats.format import Files
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import MIXED, recordings_in, skipped_in, trials_of
@@ -141,7 +142,12 @@ class FolderWatch:
             return False
         if self._done.get(path) == state:
             return True
-        return self.clock() - before[1] >= self.settled_s and not is_written(path)
+        if self.clock() - before[1] < self.settled_s:
+            return False
+        try:
+            return not is_written(path)
+        except FileNotFoundError:  # moved away meanwhile
+            return False
 
 
 def _state(path: Path) -> State:
@@ -197,6 +203,10 @@ def watch(
         raise InputError("--watch", "", str(path), "must be a folder")
     if name is None:
         raise InputError("--name", "", None, "is missing: the name of the campaign")
+    if store.resolve().is_relative_to(path.resolve()):
+        right = f"lies in {path}, where its own files would be imported; name another folder"
+        raise InputError("--store", "", str(store), right)
+    safe_name(name)
     recordings_in(path, kind or MIXED)
     watched = FolderWatch(path, store, name, kind or MIXED, simulated, salvage)
     result = watched.run()

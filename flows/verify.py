@@ -16,9 +16,8 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import (
     DAMAGED,
     StoreProblem,
-    failed_gates,
+    imported_trials,
     quarantine_damaged,
-    salvaged,
     trial_folders,
 )
 from sliplab.storage.trials.verify import verify as find_problems
@@ -34,6 +33,7 @@ class Verification(TypedDict):
         mended: data files that another program had left open for writing, now closed.
         salvaged: trials that are not all that was recorded, as ``campaign/trial``.
         failed_gates: gates that imported trials do not pass, by ``campaign/trial``.
+        dropped: rows that were left out of trials, by ``campaign/trial`` and reason.
     """
 
     trials: int
@@ -47,6 +47,7 @@ class Verification(TypedDict):
     mended: NotRequired[list[str]]
     salvaged: NotRequired[list[str]]
     failed_gates: NotRequired[dict[str, list[str]]]
+    dropped: NotRequired[dict[str, dict[str, int]]]
 
 
 def verify(place: str, quarantine: bool = False) -> Verification:
@@ -88,10 +89,14 @@ def verify(place: str, quarantine: bool = False) -> Verification:
     }
     if mended:
         result["mended"] = [str(path) for path in mended]
-    if torn := salvaged(opened):
-        result["salvaged"] = torn
-    if failing := failed_gates(opened):
-        result["failed_gates"] = failing
+    for trial, record in imported_trials(opened):
+        if record.lost is not None:
+            result.setdefault("salvaged", []).append(trial)
+        if not record.quality.passed:
+            gates = [gate for gate, each in record.quality.gates.items() if not each.passed]
+            result.setdefault("failed_gates", {})[trial] = gates
+        if record.imported is not None and record.imported.dropped:
+            result.setdefault("dropped", {})[trial] = record.imported.dropped
     return result
 
 

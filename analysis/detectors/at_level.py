@@ -54,9 +54,15 @@ class AtLevel(StreamDetector):
         self.resume(0)
 
     def warm_up(self, width: int, height: int) -> None:
-        """Push a second without events. Raises DetectorError."""
+        """Push a second without events. Raises DetectorError: that is slip at this level."""
         self.begin(width, height)
-        self.push(EventChunk.empty(), WARM_UP_US)
+        quiet = self.push(EventChunk.empty(), WARM_UP_US).value.max(initial=-np.inf)
+        # one that nothing bounds is infinite; a positive one may be meant, to try an alarm
+        if -np.inf < self.level < min(quiet, 0):
+            raise DetectorError(
+                f"level {self.level:g}: without an event its evidence is {quiet:g} already, so all "
+                "would be slip; state a higher level"
+            )
 
     def resume(self, at_us: int) -> None:
         """Begin a new scene. Raises DetectorError."""

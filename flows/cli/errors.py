@@ -141,6 +141,8 @@ def failure(error: Exception) -> Failure:
         return Failure("", error.exit_code)
     if isinstance(error, typer.Abort):
         return interruption()
+    if isinstance(error, OutputLost) and error.unread:
+        return Failure("", exit_codes.UNREAD)
     if known := exhausted(error):
         return Failure(known, exit_codes.FAILED)
     if isinstance(error, InputError):

@@ -35,6 +35,7 @@ SHOWN = (
     "attempt",
     "simulated",
     "unread_bytes",
+    "rows_lost",
 )
 """Columns of the catalogue that fit a terminal."""
 
@@ -126,6 +127,9 @@ def verify(
         console.say(
             f"{trial}: does not pass {', '.join(gates)}: intact, but not used by later steps"
         )
+    for trial, reasons in found.get("dropped", {}).items():
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        console.say(f"{trial}: intact, but without {counts}")
     if as_json:
         console.print_json(found)
     else:

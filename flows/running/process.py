@@ -25,7 +25,15 @@ PATIENCE_S = 1.0
 
 
 class OutputLost(Exception):
-    """Standard output did not take a result; the message says why."""
+    """Standard output did not take a result; the message says why.
+
+    Attributes:
+        unread: its reader has ended, as `head` does, which is no error.
+    """
+
+    def __init__(self, why: str, unread: bool = False) -> None:
+        super().__init__(f"the result cannot be written to standard output: {why}")
+        self.unread = unread
 
 
 class _ByteStream(io.RawIOBase):
@@ -39,7 +47,7 @@ class _ByteStream(io.RawIOBase):
 
     def __init__(self, handle: int, lost: str = "", *, required: bool) -> None:
         self._handle, self._lost, self._required = handle, lost, required
-        self._stalled = self._reported = False
+        self._stalled = self._reported = self._unread = False
         self._poll = select.poll()
         self._poll.register(handle, select.POLLOUT)
 
@@ -67,9 +75,10 @@ class _ByteStream(io.RawIOBase):
                 return 0
             except OSError as error:
                 self._lost = error.strerror or type(error).__name__
+                self._unread = isinstance(error, BrokenPipeError)
         if self._lost and self._required and not self._reported:
             self._reported = True
-            raise OutputLost(f"the result cannot be written to standard output: {self._lost}")
+            raise OutputLost(self._lost, self._unread)
         return len(data)
 
     def _ready(self) -> bool:

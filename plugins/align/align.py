@@ -115,6 +115,7 @@ class Stretch:
         half_ns: half the interval of 95 % in its middle.
         doubt_ns: the part of it for a jump that is neither ruled out nor certain, and for what the
             stamps' unit hides. A delay that all events share is in no interval.
+        unit_ns: what all stamps of A or of B are multiples of.
     """
 
     first_ns: int
@@ -128,6 +129,7 @@ class Stretch:
     scatter_ns: float
     half_ns: float
     doubt_ns: float
+    unit_ns: float
     state: ClockState = field(repr=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -342,7 +344,8 @@ class _Fit:
             )
         return (
             f"the clocks differ by {ppm:.0f} ppm; at most {1e6 * self.max_drift:g} ppm are "
-            "allowed: raise it, or check that both saw the same events"
+            f"allowed: raise it, or check that {'the offset is right and ' * (by == 'offset')}both "
+            "saw the same events"
         )
 
     def _explained(self, reason: str, text: str) -> str:
@@ -536,6 +539,7 @@ class _Fit:
             scatter_ns=part.state.sigma,
             half_ns=float(half[0]) + part.doubt,
             doubt_ns=part.doubt,
+            unit_ns=self.unit,
             state=part.state,
         )
 

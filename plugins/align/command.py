@@ -135,6 +135,16 @@ def align_(
     finish(result if as_json else _pairs(result), f"{a} to {b}", as_json)
 
 
+def _doubt(part: dict[str, Any]) -> str:
+    """Return why an interval is wider than the scatter of the events says."""
+    if 2 * part["doubt_ns"] < part["half_ns"]:
+        return ""
+    doubt = f"; ± {part['doubt_ns'] / 1e3:.1f} us of it"
+    if part["unit_ns"] < part["doubt_ns"]:
+        return f"{doubt}: its clock may have jumped"
+    return f"{doubt}: all stamps of A or of B are multiples of {part['unit_ns'] / 1e9:g} s"
+
+
 def _pairs(result: dict[str, Any]) -> dict[str, Any]:
     written = {key: result[key] for key in _WRITTEN if key in result}
     if "taps" in result:
@@ -156,7 +166,7 @@ def _pairs(result: dict[str, Any]) -> dict[str, Any]:
         shown[f"stretch {number}"] = (
             f"{part['events']} pairs in {seconds:.1f} s: B = A + {part['offset_ns'] / 1e9:.9f} s "
             f"± {part['half_ns'] / 1e3:.1f} us (95 %) at A = {part['middle_ns'] / 1e9:.3f} s, rate "
-            f"{part['rate_ppm']:+.3f} ppm, scatter {part['scatter_ns'] / 1e3:.1f} us"
+            f"{part['rate_ppm']:+.3f} ppm, scatter {part['scatter_ns'] / 1e3:.1f} us{_doubt(part)}"
         )
     for number, jump in enumerate(result["jumps"], 1):
         shown[f"jump {number}"] = (

@@ -44,8 +44,8 @@ DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _CHUNK = 1000
 """Files of a folder."""
-_SAMPLES = 32
-"""Frames of a trial that are decoded for the statistics of levels."""
+_SAMPLES, _LEAST_SAMPLES = 64, 8
+"""Frames of a data set, and of a trial at least, that are decoded for the statistics of levels."""
 _SAMPLE_PX = 150
 """Rows or columns of such a frame that are enough, as LeRobot has it."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -125,6 +125,7 @@ class _Set:
     folder: Path
     features: dict[str, Json]
     wrenches: tuple[str, ...]
+    samples: int
     stats: dict[str, _Stats | _Levels] = field(default_factory=dict)
     tasks: dict[str, int] = field(default_factory=dict)
     episodes: list[Json] = field(default_factory=list)
@@ -160,7 +161,7 @@ def write_lerobot(
         key=lambda item: order[publication.split(item[0].name, item[1].folder.name)],
     )
     features, wrenches = _features([recording for _, recording in trials])
-    made = _Set(folder, features, wrenches)
+    made = _Set(folder, features, wrenches, max(_SAMPLES // len(trials), _LEAST_SAMPLES))
     parts: dict[str, list[int]] = {}
     for campaign, recording in trials:
         on_trial(recording.folder.name)
@@ -389,7 +390,7 @@ def _frame_video(made: _Set, recording: Recording, shown: I64) -> None:
     copy_frames(recording.files()[VIDEO_FILE], path, shown, FPS)
     levels = made.levels(FRAMES)
     with recording.frame_reader() as reader:
-        for number in shown[:: max(len(shown) // _SAMPLES, 1)].tolist():
+        for number in shown[:: -(-len(shown) // made.samples)].tolist():
             image = reader.frame(number)
             step = max(min(image.shape) // _SAMPLE_PX, 1)
             image = image[::step, ::step]

@@ -20,26 +20,30 @@ from sliplab.analysis.clocks.synchronise import (
     synchronise,
 )
 from sliplab.plugins.record.pulsed import clocks_by_pulses
+from sliplab.plugins.record.shared_clock import SHARED, explained
 from sliplab.plugins.record.sources import (
     CLOCK_STREAM,
     FIRST_CAMERAS,
     HOST,
-    SHARED,
     TIMING,
     SourceAbout,
 )
-from sliplab.plugins.record.tapped import clock_by_taps
+from sliplab.plugins.record.tapped import ContradictionError, clock_by_taps
 from sliplab.protocols.timing import StreamTiming, Timing
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema.trial import DeviceRecord
-from sliplab.storage.streams import CLOCK, ClockReads
-from sliplab.storage.trials.checksums import DATA
+from sliplab.storage.streams import CLOCK, EVENTS_KIND, FRAMES_KIND, I64, ClockReads
+from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.verify import runs_backwards
 
 AHEAD_NS = 1_000_000_000
 """How long after they came times of the host's clock may lie where no error is stated."""
+
+DRIFT_S, LEAST_ARRIVALS = 0.2, 20
+"""By how much times must drift steadily from their arrival to be of another clock, seconds; and how
+many arrivals say so."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,12 @@ class Clocks:
     found: dict[str, DeviceRecord] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     common: list[str] = field(default_factory=list)
+
+    def contradict(self, why: str, *names: str) -> None:
+        """Refuse clocks that common events and arrivals put in different places."""
+        for name in names:
+            self.found.pop(name, None)
+            self.refused[name] = why
 
 
 def fit_clocks(
@@ -73,14 +83,18 @@ def fit_clocks(
         if tap is not None and known.keys() >= set(tap):
             try:
                 known[tap[0]] = clock_by_taps(reader, tap, sources[tap[0]], known, taps_ns)
+            except ContradictionError as error:
+                result.contradict(f"taps: {error}", tap[0])
             except ValueError as error:
                 result.common.append(f"the clock of {tap[0]} by taps: {error}")
         # which also time a clock that its arrivals could not bound
         if pulses is not None and pulses[0] in sources and pulses[1] in known:
-            shared = (name for name in pulses[2:] if name in known)
+            shared = tuple(name for name in pulses[2:] if name in known)
             try:
                 known.update(clocks_by_pulses(reader, (*pulses[:2], *shared), known))
                 result.refused.pop(pulses[0], None)
+            except ContradictionError as error:
+                result.contradict(f"pulses: {error}", pulses[0], *shared)
             except ValueError as error:
                 result.common.append(f"the clock of {pulses[0]} by pulses: {error}")
     return result
@@ -122,7 +136,9 @@ def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int
     fitted = synchronise(streams, Timing(arm="host time"), 1, with_events=False)
     for name in timed:
         if name not in fitted.devices:
-            result.refused[name] = fitted.refused[name]
+            shared = timed[name].clock in SHARED
+            why = explained(timed[name].clock, inputs[name].reads) if shared else ""
+            result.refused[name] = why or fitted.refused[name]
             continue
         record, error = fitted.devices[name].record(), errors.get(name, 0)
         source = timed[name]
@@ -137,25 +153,60 @@ def _fitted(folder: Path, sources: Mapping[str, SourceAbout], span_ns: tuple[int
 def _wrong_times(
     folder: Path, name: str, source: SourceAbout, span_ns: tuple[int, int]
 ) -> str | None:
-    """Return why a sensor's times cannot be right whatever its clock; None if they can."""
-    if source.record.of_camera:  # whose times do not fall back: late rows are left out
+    """Return why a stream's times cannot be right whatever its clock; None if they can."""
+    if not source.record.of_camera:  # whose times do not fall back: late rows are left out
+        with StreamReader(folder / DATA) as reader:
+            if runs_backwards(reader, f"{STREAM_GROUP}/{name}/t"):
+                return "its times fall back: the clock was set, or several clocks stamped the rows"
+    if source.clock != HOST:
         return None
-    t, host = (f"{STREAM_GROUP}/{name}/{part}" for part in ("t", "host"))
-    with StreamReader(folder / DATA) as reader:
-        if runs_backwards(reader, t):
-            return "its times fall back: the clock was set, or several clocks stamped the rows"
-        if source.clock != HOST:
-            return None
-        parts = zip(reader.column_parts(t), reader.column_parts(host), strict=True)
-        found = [(int((own - came).max()), int(own[-1])) for own, came in parts]
-    ahead_ns, newest_ns = np.max(found, axis=0).tolist()
+    own, came = _arrivals(folder, name, source)
+    if not own.size:
+        return None
+    ahead_ns, newest_ns = int((own - came).max()), int(own.max())
     most_ns = AHEAD_NS if source.uncertainty_ns is None else source.uncertainty_ns
     if ahead_ns > most_ns:
         return f"its times lie up to {ahead_ns / 1e9:.6f} s after they came"
     if newest_ns < span_ns[0] - most_ns:
         before_s = (span_ns[0] - newest_ns) / 1e9
         return f"all its times lie before the trial, by {before_s:.6f} s at least"
+    came, newest = np.unique(came, return_index=True)  # of rows that came together the first
+    if came.size < LEAST_ARRIVALS:
+        return None
+    late_s = (came - own[newest]) / 1e9
+    slope, start = np.polyfit(seconds := (came - came[0]) / 1e9, late_s, 1)
+    gained_s = slope * seconds[-1]
+    rest_s = float(np.std(late_s - start - slope * seconds))
+    if abs(gained_s) > max(DRIFT_S, 8 * rest_s):
+        slow = "fall behind their arrival", "slow, or the program pushes ever later"
+        what, why = (
+            slow if slope > 0 else ("run ahead of their arrival", "fast, or of another unit")
+        )
+        return f"its times {what} by {abs(1000 * slope):.3g} ms a second: its clock is {why}"
     return None
+
+
+def _arrivals(folder: Path, name: str, source: SourceAbout) -> tuple[I64, I64]:
+    """Return the times of some thousand rows and when they came, ns; of events of the newest."""
+    file, group, came = DATA, f"{STREAM_GROUP}/{name}", "host"
+    if source.record.kind == EVENTS_KIND:
+        group, came = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}", "after"
+    elif source.record.kind == FRAMES_KIND:
+        file, group = DATA if name in FIRST_CAMERAS else stream_file(name), FRAMES_KIND
+    with StreamReader(folder / file) as reader:
+        if not reader.has(f"{group}/{came}"):
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        parts = zip(
+            reader.column_parts(f"{group}/t"), reader.column_parts(f"{group}/{came}"), strict=True
+        )
+        found = []
+        for own, host in parts:
+            some = np.arange(0, len(own), max(1, len(own) // 1000))
+            some = np.r_[some, np.argmax(own), np.argmax(own - host)]
+            found.append(np.stack([own[some], host[some]]))
+    times = np.concatenate(found, axis=1)
+    order = np.argsort(times[1], kind="stable")
+    return times[0, order], times[1, order]
 
 
 def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:

@@ -113,6 +113,7 @@ class ColumnsSensor:
         self._close: Callable[[], None] = lambda: None
         self._thread: threading.Thread | None = None
         self._end = threading.Event()
+        self._datagrams = settings.place.startswith("udp:")  # which are whole rows
         self.received = self.malformed = 0
 
     def connect(self) -> None:
@@ -184,20 +185,27 @@ class ColumnsSensor:
         t_ns = host if times is None else times
         part = {"t": t_ns, "host": host, **{name: by_name[name] for name in settings.stored}}
         self.received += len(values)
-        # where a shared clock falls back, its fit says so
-        order = t_ns if settings.shared_clock is None else host
-        self._buffer.add("rows", part, order, values.nbytes)
+        # where the device's clock falls back, its fit says so
+        self._buffer.add("rows", part, host, values.nbytes)
 
     def _parse(self, data: bytes) -> tuple[list[Any], bytes]:
         """Return the whole rows in some bytes, and what is left of them."""
         settings = self._settings
         if settings.struct is not None:
-            whole = len(data) // struct.calcsize(settings.struct) * struct.calcsize(settings.struct)
+            size = struct.calcsize(settings.struct)
+            whole = len(data) // size * size
+            if self._datagrams and whole != len(data):  # the next one does not continue this one
+                self.malformed += max(whole // size, 1)
+                return [], b""
             return list(struct.iter_unpack(settings.struct, data[:whole])), data[whole:]
         lines = data.split(b"\n")
+        if self._datagrams:
+            lines.append(b"")
         found = []
         separator = None if settings.separator.isspace() else settings.separator
         for line in lines[:-1]:
+            if not line.strip():
+                continue
             cells = line.decode("ascii", "replace").strip().split(separator)
             try:
                 values = [

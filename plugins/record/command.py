@@ -77,11 +77,15 @@ def record(
     trial. After a crash, what verifies of an unfinished trial is kept by the next record or verify.
     """
     from sliplab.plugins.record.keys import pressed_keys
-    from sliplab.plugins.record.recorder import Recorder
+    from sliplab.plugins.record.recorder import Recorder, levels
 
     length_s = None if length is None else _seconds("--for", length)
     every_s = None if every is None else _seconds("--every", every)
-    given = dict(_pair(text) for text in condition or ())
+    pairs = [_pair(text) for text in condition or ()]
+    given = dict(pairs)
+    if len(given) < len(pairs):
+        raise InputError("--set", "", ", ".join(condition or ()), "gives a condition twice")
+    levels(given)  # wrong ones are said before a device is opened
     result: Json = {}
     with (
         Recorder(
@@ -172,6 +176,13 @@ class _Session:
                 self.lost[name] = self.lost.get(name, 0) + count
             self._line("")
         console.say(f"trial {trial.id} is committed")
+        about = None if trial.record is None else trial.record.imported
+        if about is not None:
+            for text in (
+                *(f"{count} {what}" for what, count in about.dropped.items()),
+                *about.warnings,
+            ):
+                console.say(f"  {text}")
 
     def _answer(self, key: str) -> bool:
         """Do what a key asks for; return False to quit."""

@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from sliplab.plugins.record.table import rows, table_kind
+from sliplab.plugins.record.table import MOST_NS, rows, table_kind
 from sliplab.protocols.later import need
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.device_settings import DriverSettings
@@ -186,8 +186,10 @@ class LslStream:
         self._held: list[_Held] = []
         self._ready: list[tuple[Any, ...]] = []
         self._reads: list[tuple[int, int, int, int]] = []
-        self._waiting = self.lost = self.received = 0
+        self._waiting = self.lost = self.malformed = self.received = 0
         self._last_t: int | None = None
+        self._moved_ns = self._told_ns = 0  # by which stamps that fell back were changed
+        self._last_read: list[tuple[int, int, int, int]] = []
         self._silence, self._unread_clock = StallTimer(), StallTimer()
 
     def connect(self) -> None:
@@ -258,10 +260,10 @@ class LslStream:
         if not parts:
             return chunk_type(self.kind).empty()
         t_ns, host, stamp, values = map(np.concatenate, zip(*parts, strict=True))
-        t_ns = np.maximum.accumulate(t_ns)
-        if self._last_t is not None:
-            t_ns = np.maximum(t_ns, self._last_t)
-        self._last_t = int(t_ns[-1])
+        first = t_ns[0] if self._last_t is None else self._last_t
+        ordered = np.maximum.accumulate(np.maximum(t_ns, first))
+        self._moved_ns = max(self._moved_ns, int((ordered - t_ns).max()))
+        t_ns, self._last_t = ordered, int(ordered[-1])
         columns = (t_ns, host, stamp, *np.ascontiguousarray(values.T))
         return rows(self.kind, "", dict(zip(self.kind.columns, columns, strict=True)))
 
@@ -280,7 +282,11 @@ class LslStream:
         """Return the readings of the clock since the last call; their times are without jumps."""
         with self._lock:
             reads, self._reads = self._reads, []
+        if not reads and self._moved_ns > self._told_ns:  # no reading may come that could say so
+            reads = self._last_read
+        self._last_read, self._told_ns = reads[-1:] or self._last_read, self._moved_ns
         columns = np.array(reads, np.int64).reshape(-1, 4).T
+        columns[3] += self._moved_ns
         return rows(CLOCK, "", dict(zip(CLOCK.columns, columns, strict=True)))
 
     def describe(self) -> Json:
@@ -289,7 +295,11 @@ class LslStream:
         if self._info is not None:
             about |= {"source_id": self._info.source_id(), "host": self._info.hostname()}
         jumps = {"shift_ns": self._jumps.shift_ns, "error_ns": self._jumps.error_ns}
-        return {**about, "clock_jumps": jumps, "counts": {"lost": self.lost}}
+        return {
+            **about,
+            "clock_jumps": jumps,
+            "counts": {"lost": self.lost, "malformed": self.malformed},
+        }
 
     def close(self) -> None:
         """Close the connection."""
@@ -313,7 +323,9 @@ class LslStream:
                 else:
                     reading = None
             except (TimeoutError, RuntimeError) as error:
-                self._fault = f"is lost: {error}"
+                with self._lock:
+                    self._release(None, None, 0)
+                    self._fault = f"is lost: {error}"
                 return
             with self._lock:
                 if len(stamps) and self._running:
@@ -323,6 +335,9 @@ class LslStream:
 
     def _hold(self, stamps: Any, host_ns: int, values: Any) -> None:
         self.received += len(stamps)
+        if not (good := np.abs(stamps) < MOST_NS / 1e9).all():  # which NaN is not
+            self.malformed += int((~good).sum())
+            stamps, values = stamps[good], np.asarray(values)[good]
         if self._waiting + len(stamps) > MOST_WAITING:
             self.lost += len(stamps)
             return

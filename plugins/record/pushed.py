@@ -15,6 +15,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
+    I64,
     SCALAR,
     Chunk,
     EventChunk,
@@ -27,8 +28,8 @@ MOST_BYTES = 256 * 10**6
 READ_BYTES = 16 * 10**6
 """Data that are read at once, so that a program that pushes too fast costs no more memory."""
 LATE_NS = 500_000_000
-"""Rows that are older than newer ones by less are of a slow thread; by more, the clock fell back.
-"""
+"""Rows wait so long for older ones, of a slow thread; ones that are older by more fell back."""
+_WHOLE = 2**53
 _DAY_NS = 86_400 * 10**9
 
 
@@ -63,8 +64,10 @@ class PushedStream:
         self._reset()
 
     def _reset(self) -> None:
-        self._parts: deque[Chunk] = deque()
+        self._parts: deque[tuple[int, Chunk]] = deque()  # and when they were pushed
         self._bytes = self._number = 0
+        self._newest: int | None = None
+        self._unordered = self._fell = False
         self._last: int | None = None
         self.lost = self.late = 0
 
@@ -124,38 +127,64 @@ class PushedStream:
             if isinstance(chunk, FrameChunk):  # numbered in their order
                 chunk.number[:] += self._number
                 self._number += len(chunk)
-            self._parts.append(chunk)
+            if self.kind is not None and len(chunk):
+                self._note_order(chunk.times)
+            self._parts.append((now, chunk))
             self._bytes += size
 
-    def read(self) -> Chunk:
-        """Return rows since the last call, in order of time; late ones are left out.
+    def _note_order(self, times: I64) -> None:
+        first = int(times[0]) if self._newest is None else self._newest
+        newest = np.maximum.accumulate(np.maximum(times, first))
+        behind = int((newest - times).max())
+        self._newest = int(newest[-1])
+        self._unordered |= behind > 0
+        self._fell |= behind >= LATE_NS
 
-        Numbers of a clock that fell back stay as they were pushed: its fit refuses them.
+    def read(self) -> Chunk:
+        """Return rows since the last call, in order of time.
+
+        Numbers wait for `LATE_NS`. Those of a clock that fell back stay as they were pushed: its
+        fit refuses them. Events and frames that are late are left out, and counted.
         """
         parts: list[Chunk] = []
         size = 0
         with self._lock:
-            while self._parts and size < READ_BYTES:
-                parts.append(self._parts.popleft())
+            ripe = time.monotonic_ns()
+            if self.kind is not None and self._running and not self._fell:
+                ripe -= LATE_NS
+            while self._parts and size < READ_BYTES and self._parts[0][0] <= ripe:
+                parts.append(self._parts.popleft()[1])
                 size += _bytes(parts[-1])
+            if parts and self._unordered and not self._fell:
+                parts += self._older(max(int(part.times.max(initial=-MOST_NS)) for part in parts))
+                size = sum(map(_bytes, parts))
             self._bytes -= size
         chunk = type(parts[0]).concatenate(parts) if parts else self.empty()
-        if not len(chunk):
-            return chunk
-        last = int(chunk.times[0]) if self._last is None else self._last
-        newest = np.maximum.accumulate(np.maximum(chunk.times, last))
-        if self.kind is not None and int((newest - chunk.times).max()) >= LATE_NS:
-            self._last = int(chunk.times[-1])
+        if self._fell or not len(chunk):
             return chunk
         if np.any(chunk.times[1:] < chunk.times[:-1]):
             chunk = chunk[np.argsort(chunk.times, kind="stable")]
-        if self._last is not None and chunk.times[0] < self._last:
+        if self.kind is None and self._last is not None and chunk.times[0] < self._last:
             good = chunk.times >= self._last
             self.late += int((~good).sum())
             chunk = chunk[good]
         if len(chunk):
             self._last = int(chunk.times[-1])
         return chunk
+
+    def _older(self, newest: int) -> list[Chunk]:
+        """Remove and return the rows that wait and are older than a time."""
+        found: list[Chunk] = []
+        left: deque[tuple[int, Chunk]] = deque()
+        for at, part in self._parts:
+            old = part.times < newest
+            if old.any():
+                found.append(part[old])
+                part = part[~old]
+            if len(part):
+                left.append((at, part))
+        self._parts = left
+        return found
 
     @property
     def waiting(self) -> bool:
@@ -188,9 +217,9 @@ class PushedStream:
         if len(values) > len(expected) or set(given) != set(expected):
             found = [*given, *map(str, values[len(expected) :])]
             raise InputError(self._name, "", found, f"must be the columns {', '.join(expected)}")
-        arrays = {name: np.atleast_1d(np.asarray(value)) for name, value in given.items()}
         if self._camera == FRAMES_KIND:
             return self._frames(times, now, np.asarray(given["images"]))
+        arrays = {name: self._numbers(name, value) for name, value in given.items()}
         if wrong := [name for name, each in arrays.items() if each.shape != times.shape]:
             text = f"must have one number for each of {len(times)} times"
             raise InputError(self._name, wrong[0], arrays[wrong[0]].shape, text)
@@ -201,6 +230,25 @@ class PushedStream:
         names = ("value",) if self.kind == SCALAR else self.columns
         by_name = dict(zip(names, (arrays[name] for name in self.columns), strict=True))
         return rows(self.kind, self.unit, {"t": times, "host": host, **by_name})
+
+    def _numbers(self, name: str, value: Any) -> Any:
+        """Return values of a column as an array of its own: the program may use theirs again."""
+        try:
+            found = np.atleast_1d(np.array(value))
+        except ValueError:  # lists of different lengths
+            found = np.empty(0, object)
+        if found.dtype.kind not in "biuf":
+            raise InputError(self._name, name, value, "must be a number, or numbers")
+        if (
+            found.dtype.kind in "iu"
+            and found.size
+            and max(-int(found.min()), int(found.max())) > _WHOLE
+        ):
+            text = "cannot be stored: float64 holds whole numbers up to 2**53; push it in two parts"
+            raise InputError(self._name, name, int(found[np.argmax(np.abs(found))]), text)
+        if self._camera == EVENTS_KIND and not np.array_equal(found, np.floor(found)):
+            raise InputError(self._name, name, value, "must be whole numbers")
+        return found
 
     def _events(self, times: Any, arrays: Mapping[str, Any]) -> EventChunk:
         assert self._size is not None

@@ -7,12 +7,13 @@ to a second before a crash is kept by the next recording (`plugins.record.salvag
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import socket
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,8 +26,9 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.plugins.record.campaign import join
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.salvage import salvage_campaign
-from sliplab.plugins.record.sources import Source, opened
-from sliplab.plugins.record.tapped import check_common
+from sliplab.plugins.record.sources import READS, Source, is_bound, opened
+from sliplab.plugins.record.table import MOST_NS
+from sliplab.plugins.record.tapped import check_common, check_pulses
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
@@ -35,7 +37,7 @@ from sliplab.rigs.rig_lock import lock_file, locked
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import safe_name, write_json
 from sliplab.storage.interrupts import uninterrupted
-from sliplab.storage.schema.trial import Mark, Provenance
+from sliplab.storage.schema.trial import Mark, Provenance, TrialRecord
 from sliplab.storage.streams import FRAMES_KIND, Chunk
 from sliplab.storage.trials.prefix_journal import BEGUN
 from sliplab.storage.trials.store import Campaign, Store
@@ -49,6 +51,8 @@ TAIL_S = 0.1
 """Time for which streams are read after the end of a trial: data are on their way, s."""
 START_S, END_S = 60.0, 600.0
 """Longest time for devices to start; and for a trial to end, which fits clocks and seals files."""
+LOST = ("lost", "late", "overflowed", "dropped", "malformed")
+"""Counts of a device of rows that are not recorded."""
 _FRAME_RATE = 100
 """Time base of videos only."""
 _UNITS = {each.symbol.lower().replace("/", "_"): each.symbol for each in TABLE}
@@ -110,6 +114,8 @@ class Recorder:
             for key, names in (("tap", self._tap), ("pulses", self._pulses)):
                 if names is not None:
                     check_common(key, names, self.sources)
+            if self._pulses is not None and all(s.clock != READS for s in self.sources):
+                check_pulses(self._pulses, self.sources)
             store = Store.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
@@ -124,6 +130,8 @@ class Recorder:
             self.salvaged = salvage_campaign(self.campaign)
             for source in self.sources:
                 source.stream.connect()
+            if self._pulses is not None:  # columns of LSL are known now
+                check_pulses(self._pulses, self.sources)
             self._undo = undo.pop_all()
         return self
 
@@ -145,7 +153,7 @@ class Recorder:
         """
         if self._running is not None:
             raise RuntimeError("a trial is being recorded; end it first")
-        return RecordedTrial(self, dict(level(name, value) for name, value in condition.items()))
+        return RecordedTrial(self, levels(condition))
 
     def _next_id(self) -> tuple[str, int]:
         known = {
@@ -157,13 +165,29 @@ class Recorder:
         return f"{number:06d}", number - 1
 
 
-def level(name: str, value: object) -> tuple[str, str]:
-    """Return a factor and its level as text. Raises InputError."""
+def levels(condition: Mapping[str, object]) -> dict[str, str]:
+    """Return the levels of a condition as text, by factor. Raises InputError."""
+    found: dict[str, str] = {}
+    for name, value in condition.items():
+        factor, text = _level(name, value)
+        if factor in found:
+            raise InputError("trial", name, value, f"gives the factor {factor} a second time")
+        found[factor] = text
+    return found
+
+
+def _level(name: str, value: object) -> tuple[str, str]:
+    if not name.isidentifier():
+        raise InputError("trial", name, value, "must have a name of letters, digits and _")
     if isinstance(value, bool) or not isinstance(value, (str, int, float, np.number)):
         raise InputError("trial", name, value, "must be text or a number")
     if isinstance(value, str):
         return name, _LEVEL.sub("_", value) or "_"
-    if not np.isfinite(value):
+    try:
+        finite = math.isfinite(float(value))
+    except OverflowError:
+        finite = False
+    if not finite:
         raise InputError("trial", name, value, "must be a finite number")
     for suffix, unit in _UNITS.items():
         if name.endswith(f"_{suffix}") and len(name) > len(suffix) + 1:
@@ -177,18 +201,21 @@ class RecordedTrial:
     Attributes:
         id: its id in the campaign, once it has begun.
         faults: why streams have ended, by name.
+        record: once it is committed.
     """
 
     def __init__(self, recorder: Recorder, condition: dict[str, str]) -> None:
         self._recorder, self._condition = recorder, condition
         self.id = ""
         self.faults: dict[str, str] = {}
+        self.record: TrialRecord | None = None
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._began, self._end = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._ended_by = ""
         self._lock = threading.Lock()
         self._marks: list[Mark] = []
+        self._drained = False
         self.begin_ns = self._end_ns = 0
         self.bytes_written = 0
 
@@ -261,12 +288,26 @@ class RecordedTrial:
         Args:
             t_ns: on the host's clock (``time.monotonic_ns()``); None is now.
             uncertainty_ms: bound of its error; None where it is unknown.
+
+        Raises:
+            InputError: an argument. RuntimeError: the trial has ended.
         """
         if not name or not name.isprintable() or len(name) > 100:
             raise InputError("mark", "", name, "must be printable text of 100 characters at most")
+        if t_ns is not None and (
+            isinstance(t_ns, bool)
+            or not isinstance(t_ns, (int, np.integer))
+            or abs(int(t_ns)) >= MOST_NS
+        ):
+            raise InputError("mark", "t_ns", t_ns, "must be whole ns, as time.monotonic_ns() gives")
+        if uncertainty_ms is not None and not is_bound(uncertainty_ms):
+            right = "must be a finite number of milliseconds, not negative"
+            raise InputError("mark", "uncertainty_ms", uncertainty_ms, right)
         at = time.monotonic_ns() if t_ns is None else int(t_ns)
         error = None if uncertainty_ms is None else uncertainty_ms * 1e6
         with self._lock:
+            if self._drained:
+                raise RuntimeError(f"mark '{name}': the trial has ended")
             self._marks.append(Mark(name=name, t_ns=at, uncertainty_ns=error))
 
     def rows(self) -> dict[str, int]:
@@ -278,10 +319,16 @@ class RecordedTrial:
         found = {}
         for source in self._recorder.sources:
             counts = (source.stream.describe() or {}).get("counts", {})
-            lost = sum(int(counts.get(key, 0)) for key in ("lost", "late", "overflowed", "dropped"))
-            if lost:
+            if lost := sum(int(counts.get(key, 0)) for key in LOST):
                 found[source.name] = lost
         return found
+
+    def _note(self, writer: TrialWriter, begun: BegunTrial, changed: bool = False) -> None:
+        """Write down how the trial was begun if that has changed, or what is lost."""
+        dropped = {f"rows of {name} that were lost": n for name, n in self.lost().items()}
+        if changed or dropped != begun.dropped:
+            begun.dropped = dropped
+            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
 
     def _wait(self, event: threading.Event, seconds: float, what: str) -> None:
         if not event.wait(seconds):
@@ -345,13 +392,14 @@ class RecordedTrial:
             for source in sources:
                 source.start()
             self.begin_ns = begun.begin_ns = time.monotonic_ns()
-            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
+            self._note(writer, begun, changed=True)
             self._began.set()
             noted = time.monotonic()
             while not self._end.wait(POLL_S):
                 self._drain(writer, begun)
                 if time.monotonic() - noted >= MARK_S:
                     writer.mark()
+                    self._note(writer, begun)
                     self.bytes_written = sum(p.stat().st_size for p in writer.folder.iterdir())
                     noted = time.monotonic()
             tail = time.monotonic() + TAIL_S
@@ -375,9 +423,10 @@ class RecordedTrial:
                 source.fault = self.faults[source.name] = str(error)
         with self._lock:
             marks, self._marks = self._marks, []
+            self._drained = last
         if marks:
             begun.marks += marks
-            write_json(writer.folder / BEGUN, begun.model_dump(mode="json"))
+            self._note(writer, begun, changed=True)
 
     def _commit(self, writer: TrialWriter, begun: BegunTrial) -> None:
         """Fit the clocks, and commit the trial."""
@@ -385,11 +434,9 @@ class RecordedTrial:
         notes = [f"ended by {self._ended_by}"] if self._ended_by else []
         notes += [f"{fault}; the stream ended there" for fault in self.faults.values()]
         devices = {s.name: about for s in sources if (about := s.stream.describe()) is not None}
-        dropped = {f"rows of {name} that were lost": n for name, n in self.lost().items()}
+        self._note(writer, begun)
         folder = writer.seal()
-        record = make_record(
-            folder, begun, self._end_ns, tuple(notes), dropped=dropped, devices=devices
-        )
+        record = make_record(folder, begun, self._end_ns, tuple(notes), devices=devices)
         provenance = Provenance(
             started=begun.started,
             ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -399,6 +446,7 @@ class RecordedTrial:
             versions=installed_versions(RECORDING),
         )
         writer.commit(record, provenance)
+        self.record = record
 
 
 def record(

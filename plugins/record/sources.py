@@ -14,10 +14,11 @@ import numpy as np
 from pydantic import BaseModel
 
 from sliplab.plugins.record.pushed import PushedStream
+from sliplab.plugins.record.shared_clock import SHARED, doubt, now_ns
 from sliplab.plugins.record.table import rows
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.timing import WIRED, StreamGrade, StreamTiming
+from sliplab.protocols.timing import WIRED, Delay, StreamGrade, StreamTiming
 from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
 from sliplab.rigs.build import driven_stream, taught_frame
 from sliplab.rigs.core.device_stream import DeviceStream
@@ -53,11 +54,10 @@ from sliplab.storage.streams import (
 HOST, READS, TIMING = "host stamps", "clock readings", "timing"
 """How a stream's times come onto the host's clock: they are of that clock; its clock was read; or
 by the timing that its file says."""
-SHARED = {"ptp": time.CLOCK_TAI, "utc": time.CLOCK_REALTIME}
-"""Clocks that devices and the host share, as the host has them: by PTP (TAI), or UTC."""
 _SHORT = re.compile(r"(?:([a-z][a-z0-9_]*)=)?(lsl|usb):(.+)")
 FIRST_CAMERAS = (EVENTS_KIND, FRAMES_KIND)
 CLOCK_STREAM = "{}_clock"
+MOST_DELAY_MS = 10_000.0
 
 
 class StreamsFile(StrictModel):
@@ -77,6 +77,8 @@ class SourceAbout(BaseModel):
     clock: str
     uncertainty_ns: float | None = None
     """Of stamps of the host's clock or of a shared one, where it is stated."""
+    doubt: str = ""
+    """What is to be said of the clock that it shares, see `plugins.record.shared_clock`."""
 
 
 @dataclass
@@ -89,6 +91,7 @@ class Source:
         locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
         fault: why it has ended within the trial; None while it runs.
         rows: that came in this trial.
+        used: a recorder has it.
     """
 
     stream: DeviceStream
@@ -97,6 +100,7 @@ class Source:
     locks: Mapping[str, str] = field(default_factory=dict)
     fault: str | None = None
     rows: int = 0
+    used: bool = False
     _drained_ns: int = 0
 
     @property
@@ -113,14 +117,22 @@ class Source:
     def about(self) -> SourceAbout:
         """What a trial's record says of it."""
         return SourceAbout(
-            record=self.stream.about, clock=self.clock, uncertainty_ns=self.uncertainty_ns
+            record=self.stream.about,
+            clock=self.clock,
+            uncertainty_ns=self.uncertainty_ns,
+            doubt=doubt(self.clock),
         )
 
     def expected(self) -> dict[str, tuple[Chunk, ...]]:
         """Return empty chunks of what may come, by stream; the device is connected."""
         clock = {CLOCK_STREAM.format(self.name): (chunk_type(CLOCK).empty(),)}
-        read = self.clock == READS or self.clock in SHARED
-        return {self.name: self._chunks()} | (clock if read else {})
+        return {self.name: self._chunks()} | (clock if self.clock_is_read else {})
+
+    @property
+    def clock_is_read(self) -> bool:
+        """Whether readings of its clock are stored; arrivals of events have no other place."""
+        pushed = self.clock == HOST and self.stream.about.kind == EVENTS_KIND
+        return self.clock == READS or self.clock in SHARED or pushed
 
     def _chunks(self) -> tuple[Chunk, ...]:
         kind, unit = self.stream.about.kind, self.stream.about.unit or ""
@@ -156,7 +168,7 @@ class Source:
         if last:
             self.stream.finish(seen)
         now = time.monotonic_ns()
-        if self.clock == READS or self.clock in SHARED:
+        if self.clock_is_read:
             sink.add(CLOCK_STREAM.format(self.name), self._clock_reads(seen, now))
         self._drained_ns = now
 
@@ -169,23 +181,25 @@ class Source:
         if seen.newest_ns is not None:
             timing = self.stream.about.timing or StreamTiming()
             error = round(self.uncertainty_ns or 0)
-            # the newest row came after the call before, and was sent not longer before than its way
-            before = self._drained_ns - round(timing.delay.longest_us * 1000)
-            found.append((seen.newest_ns, before - error, now + error, 0))
+            # events have no time of arrival: they came after the call before
+            came = (self._drained_ns, now) if seen.host_ns is None else (seen.host_ns,) * 2
+            before = came[0] - round(timing.delay.longest_us * 1000)
+            found.append((seen.newest_ns, before - error, came[1] + error, 0))
         if self.clock in SHARED:
             before = time.monotonic_ns()
-            t_ns = time.clock_gettime_ns(SHARED[self.clock])
+            t_ns = now_ns(self.clock)
             found.append((t_ns, before, time.monotonic_ns(), 0))
         columns = np.array(found, np.int64).reshape(-1, 4).T
         return rows(CLOCK, "", dict(zip(CLOCK.columns, columns, strict=True)))
 
 
 class _Newest:
-    """A sink that counts a source's rows, and notes the time of its newest."""
+    """A sink that counts a source's rows, and notes the time of its newest, and its arrival's."""
 
     def __init__(self, sink: Sink, source: Source) -> None:
         self._sink, self._source = sink, source
         self.newest_ns: int | None = None
+        self.host_ns: int | None = None
 
     def add(self, device: str, chunk: Chunk) -> None:
         if not isinstance(chunk, (PulseChunk, ClockReads)):
@@ -193,6 +207,8 @@ class _Newest:
             if len(chunk):
                 unit = 1000 if isinstance(chunk, EventChunk) else 1
                 self.newest_ns = int(chunk.times[-1]) * unit
+                if (host := chunk.KIND.columns.get("host")) is not None:
+                    self.host_ns = int(getattr(chunk, host.field)[-1])
         self._sink.add(device, chunk)
 
 
@@ -204,6 +220,7 @@ def push(
     frames_px: tuple[int, int] | None = None,
     clock: str = "host",
     uncertainty_ms: float | None = None,
+    delay_ms: float = 50.0,
 ) -> Source:
     """Declare a stream that the program pushes by `RecordedTrial.push`.
 
@@ -216,6 +233,7 @@ def push(
             which the host has too, by PTP or NTP: refused where the times of pushing contradict it.
         uncertainty_ms: bound of the error of times of the host's clock, None where it is unknown;
             of ``ptp`` and ``utc`` it must be stated.
+        delay_ms: longest time from a row's time to its push; of times of the host's clock any.
 
     Raises:
         InputError: an argument.
@@ -225,11 +243,14 @@ def push(
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
     if clock not in {"host", "own", *SHARED}:
         raise InputError(name, "clock", clock, "must be host, own, ptp or utc")
-    if uncertainty_ms is not None and not _is_bound(uncertainty_ms):
+    if uncertainty_ms is not None and not is_bound(uncertainty_ms):
         right = "must be a finite number of milliseconds, not negative"
         raise InputError(name, "uncertainty_ms", uncertainty_ms, right)
     if clock in SHARED and uncertainty_ms is None:
         raise InputError(name, "uncertainty_ms", None, f"is needed with clock={clock!r}")
+    if not (is_bound(delay_ms) and 0 < delay_ms <= MOST_DELAY_MS):
+        right = f"must be a number of milliseconds, above 0 and up to {MOST_DELAY_MS:g}"
+        raise InputError(name, "delay_ms", delay_ms, right)
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
     _check_name(name, kind)
     size = events_px or frames_px
@@ -241,9 +262,11 @@ def push(
         told["unit"] = device.unit
     if kind == FRAMES_KIND:
         told["mid_exposure_ns"] = 0
-    if clock == "own":
+    if clock != "host":
         grade: StreamGrade = "host arrival" if kind == FRAMES_KIND else "host time"
-        told["timing"] = StreamTiming(grade=grade)
+        delay = Delay(shortest_us=0, longest_us=1000 * delay_ms)
+        told["timing"] = StreamTiming(grade=grade, delay=delay)
+    if clock == "own":
         how = READS if kind == EVENTS_KIND else TIMING
     else:
         how = clock if clock in SHARED else HOST
@@ -251,7 +274,7 @@ def push(
     return Source(DeviceStream(name, device, StreamRecord(**told)), how, error)
 
 
-def _is_bound(value: object) -> bool:
+def is_bound(value: object) -> bool:
     """Return whether a value is a finite number, not negative."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         return False
@@ -346,12 +369,22 @@ def opened(streams: Iterable[str | Path | Source], undo: ExitStack) -> list[Sour
     found: list[Source] = []
     for each in streams:
         for source in [each] if isinstance(each, Source) else _of_text(str(each)):
+            if source.used:
+                right = "is being recorded already; declare another stream"
+                raise InputError("streams", "", source.name, right)
+            source.used = True
+            undo.callback(setattr, source, "used", False)
             undo.callback(source.stream.close)
             if source.name in {other.name for other in found}:
                 raise InputError("streams", "", source.name, "is the name of two streams")
             found.append(source)
     if not found:
         raise InputError("streams", "", None, "names no stream")
+    for source in found:
+        clock = CLOCK_STREAM.format(source.name)
+        if source.clock_is_read and clock in {other.name for other in found}:
+            text = f"is the name of the readings of the clock of {source.name}; choose another one"
+            raise InputError("streams", "", clock, text)
     return found
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.analysis.clocks.synchronise import HOST_PPM
 from sliplab.analysis.clocks.taps import Taps, find_taps, map_by_taps
-from sliplab.plugins.record.sources import READS, TIMING, Source, SourceAbout
+from sliplab.plugins.record.sources import HOST, READS, TIMING, Source, SourceAbout
+from sliplab.plugins.record.table import PULSES
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.timing import StreamTiming
 from sliplab.storage.clockmap import ClockMap
@@ -27,22 +28,46 @@ NEAR_NS = 1_000_000_000
 """Time on either side of such a mark in which taps are looked for."""
 
 
-def check_common(key: str, names: tuple[str, ...], sources: Iterable[Source]) -> None:
+class ContradictionError(NoMatchError):
+    """Common events and arrivals put a clock in different places."""
+
+
+def check_common(key: str, names: tuple[str, ...] | str, sources: Iterable[Source]) -> None:
     """Raise InputError unless all of two or more sensors but the second have their own clock.
 
     Args:
         key: ``tap`` or ``pulses``, which they have in common.
     """
     known = {source.name: source for source in sources if not source.stream.about.of_camera}
-    if not known.keys() >= set(names) or len(set(names)) < max(2, len(names)):
-        text = f"must be different sensors of {', '.join(known) or 'which there are none'}"
-        raise InputError(key, "", ", ".join(names), text)
+    if isinstance(names, str):
+        text = f"must be a tuple of names, such as {tuple(names.split(','))}"
+        raise InputError(key, "", names, text)
+    most = 2 if key == TAP else len(names)
+    if not known.keys() >= set(names) or not 2 <= len(set(names)) == len(names) <= most:
+        right = "two different" if key == TAP else "two or more different"
+        text = f"must be {right} sensors of {', '.join(known) or 'which there are none'}"
+        raise InputError(key, "", ", ".join(map(str, names)), text)
     for name in (names[0], *names[2:]):
         timing = known[name].stream.about.timing or StreamTiming()
         own = known[name].clock == TIMING and timing.grade == "host time"
         if not own and known[name].clock != READS:
             text = f"has no clock of its own that {key} could align; name it second"
             raise InputError(key, "", name, text)
+    second = known[names[1]]
+    if second.clock == HOST and second.uncertainty_ns is None:
+        text = (
+            f"must say how far its times may be off, for {key} to rely on: uncertainty_ms of push"
+        )
+        raise InputError(key, "", names[1], text)
+
+
+def check_pulses(names: tuple[str, ...], sources: Iterable[Source]) -> None:
+    """Raise InputError unless two sensors, which are connected, see pulses in the same way."""
+    known = {source.name: source.device.kind for source in sources}
+    seen = [next((part for part in PULSES if part in known[n].columns), "none") for n in names[:2]]
+    if "none" in seen or len(set(seen)) > 1:
+        text = f"have the columns {' and '.join(seen)}; must both have one of {', '.join(PULSES)}"
+        raise InputError("pulses", "", ", ".join(names[:2]), text)
 
 
 def clock_by_taps(
@@ -92,16 +117,17 @@ def closer(
         about: what the record says of the clock by common events.
 
     Raises:
-        NoMatchError: they contradict each other.
+        ContradictionError: they contradict each other.
     """
     middle, half = least + (most - least) // 2, float((most - least).max()) / 2 + 1
     if first is not None:
         known = first.uncertainty_ns or 0
         off = np.abs(middle - first.map.to_reference(at)).max()
         if off > half + known:
-            raise NoMatchError(
+            raise ContradictionError(
                 "no_match",
-                f"it would be off by {off / 1e6:.1f} ms from where its arrivals put it",
+                f"they put it {off / 1e6:.1f} ms from where its arrivals do: one of both is wrong; "
+                "do rows come later than delay_ms, or did the two see different ones?",
             )
         if half >= (first.uncertainty_ns or np.inf):
             return first

@@ -38,6 +38,7 @@ class BegunTrial(BaseModel):
 
     Attributes:
         begin_ns: on the host's clock. started: UTC, ISO 8601.
+        dropped: rows that were left out so far, by reason.
         tap: two sensors that felt the same taps. pulses: see `plugins.record.pulsed`.
     """
 
@@ -52,6 +53,7 @@ class BegunTrial(BaseModel):
     operator: str = ""
     sources: dict[str, SourceAbout]
     marks: list[Mark] = Field(default_factory=list)
+    dropped: dict[str, int] = Field(default_factory=dict)
     tap: tuple[str, str] | None = None
     pulses: tuple[str, ...] | None = None
 
@@ -63,7 +65,6 @@ def make_record(
     warnings: tuple[str, ...] = (),
     *,
     lost: Lost | None = None,
-    dropped: Mapping[str, int] | None = None,
     devices: Mapping[str, Any] | None = None,
 ) -> TrialRecord:
     """Return the record of a trial whose files are complete; their clocks are fitted.
@@ -71,7 +72,7 @@ def make_record(
     Args:
         end_ns: of the trial, on the host's clock.
         lost: of a trial that was cut.
-        dropped: rows that were left out, by reason. devices: what devices report, by name.
+        devices: what devices report, by name.
     """
     span = begun.begin_ns, max(end_ns, begun.begin_ns + 1)
     streams = _streams(folder, begun)
@@ -88,6 +89,7 @@ def make_record(
     inside = [mark for mark in marks if span[0] <= mark.t_ns <= span[1]]
     notes = [f"mark {m.name} lies outside of the trial" for m in marks if m not in inside]
     notes += [f"nothing came from {name}" for name in begun.sources if name not in present]
+    notes += [f"{name}: {each.doubt}" for name, each in present.items() if each.doubt]
     notes += clocks.common
     notes += [f"the clock of {name} is not known: {why}" for name, why in clocks.refused.items()]
     about: dict[str, Any] = {
@@ -102,7 +104,7 @@ def make_record(
         "given": _given(inside),
         "marks": marks,
         "lost": lost,
-        "dropped": dict(dropped or {}),
+        "dropped": begun.dropped,
     }
     about |= {key: value for key, value in more.items() if value}
     named = {name: record for name, (_, record) in streams.items() if name not in FIRST_CAMERAS}

@@ -44,7 +44,7 @@ else:
     pa = Later("pyarrow")
     pq = Later("pyarrow.parquet")
 
-VERSION = 2
+VERSION = 3
 """Of the index and of the catalogue's rows: a change of either counts on."""
 FRESH_NS = 2_000_000_000
 """Age below which a change may not show in a time stamp: some disks count in seconds."""
@@ -54,6 +54,8 @@ _NAME, _ROW, _INODE, _CHANGED, _SYNC = (
 _META = b"sliplab"
 UNREAD = "unread_bytes"
 """Column of a catalogue with salvaged trials: the number of unread bytes of their files."""
+DROPPED = "rows_lost"
+"""Column of a catalogue with trials some rows of which were left out: how many."""
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
@@ -384,9 +386,12 @@ def _row(campaign: str, recording: Recording) -> Row:
 
 
 def _missing(recording: Recording) -> Row:
-    """Return the cell of a trial that was salvaged from a damaged file; of others there is none."""
-    lost = recording.record.lost
-    return {} if lost is None else {UNREAD: lost.unread_bytes}
+    """Return the cells of a trial that is not all that was recorded; of others there are none."""
+    lost, imported = recording.record.lost, recording.record.imported
+    cells: Row = {} if lost is None else {UNREAD: lost.unread_bytes}
+    if imported is not None and imported.dropped:
+        cells[DROPPED] = sum(imported.dropped.values())
+    return cells
 
 
 @dataclass

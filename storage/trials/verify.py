@@ -6,7 +6,7 @@ Nothing is changed but a file that another program left open for writing: it is 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,40 +134,19 @@ def trial_folders(campaign: Campaign) -> list[Path]:
     return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
-def salvaged(store: Store) -> list[str]:
-    """Return the trials that were salvaged from damaged files, as ``campaign/trial``.
+def imported_trials(store: Store) -> Iterator[tuple[str, TrialRecord]]:
+    """Yield the records of imported and recorded trials, with ``campaign/trial``.
 
-    They are intact, but not all that was recorded. Trials that cannot be read are left out.
+    They may be intact, but not all that was recorded, or be used by no later step. Trials that
+    cannot be read are left out.
     """
-    found = []
     for campaign in store.campaigns():
         names: list[str] = []
         with suppress(StoreError, ValueError):
             names = sorted(campaign.committed()) if IMPORTED in campaign.info else []
         for name in names:
             with suppress(StoreError):
-                if campaign.recording(name).record.lost is not None:
-                    found.append(f"{campaign.name}/{name}")
-    return found
-
-
-def failed_gates(store: Store) -> dict[str, list[str]]:
-    """Return the gates that imported trials do not pass, by ``campaign/trial``.
-
-    They are intact, and no later step uses them. Trials that cannot be read are left out.
-    """
-    found = {}
-    for campaign in store.campaigns():
-        names: list[str] = []
-        with suppress(StoreError, ValueError):
-            names = sorted(campaign.committed()) if IMPORTED in campaign.info else []
-        for name in names:
-            with suppress(StoreError):
-                quality = campaign.recording(name).record.quality
-                if not quality.passed:
-                    gates = [gate for gate, each in quality.gates.items() if not each.passed]
-                    found[f"{campaign.name}/{name}"] = gates
-    return found
+                yield f"{campaign.name}/{name}", campaign.recording(name).record
 
 
 def verify_trial(folder: Path) -> list[StoreProblem]:

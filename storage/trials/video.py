@@ -184,9 +184,9 @@ def copy_frames(source: Path, target: Path, numbers: I64, rate_hz: int) -> None:
         stream = written.add_stream_from_template(read.streams.video[0])
         stream.time_base = base
         at, number = next(due, (0, None))
-        for here, data in enumerate(bytes(packet) for packet in read.demux(video=0)):
-            while number == here and data:
-                packet = av.Packet(data)
+        for here, source_packet in enumerate(read.demux(video=0)):
+            while number == here and source_packet.size:
+                packet = av.Packet(source_packet)
                 packet.stream, packet.time_base, packet.is_keyframe = stream, base, True
                 packet.pts, packet.dts, packet.duration = at, at, 1
                 written.mux(packet)

@@ -13,6 +13,7 @@ import pytest
 from sliplab.flows.collecting.requests import STORE_LOCK
 from sliplab.flows.folder_watch import FolderWatch, is_written, watch
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import Store
 from tests.command_line import SLIPLAB, here
@@ -120,6 +121,11 @@ def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
 def test_wrong_arguments(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must be a folder"):
         watch(tmp_path / "none", tmp_path / "store", "a", None)
+    with pytest.raises(InputError, match="its own files would be imported"):
+        watch(tmp_path, tmp_path / "store", "a", None)
+    (tmp_path / "in").mkdir()
+    with pytest.raises(StoreError, match="cannot be the name"):
+        watch(tmp_path / "in", tmp_path / "store", "../a", None)
     done = here(
         "import", tmp_path, "--store", tmp_path / "s", "--name", "a", "--watch", "--dry-run"
     )

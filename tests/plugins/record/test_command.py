@@ -78,6 +78,8 @@ def test_for_and_every_make_trials_of_their_length(tmp_path: Path, streams: Path
         (["nothing.yaml"], "no such file"),
         (["lsl:x", "--for", "soon"], "must be a time with its unit"),
         (["lsl:x", "--set", "mug"], "must be NAME=VALUE"),
+        (["lsl:x", "--set", "a=1", "--set", "a=2"], "gives a condition twice"),
+        (["lsl:x", "--set", "grip_n=1", "--set", "grip=2"], "gives the factor grip a second time"),
         (["usb:/dev/video0@big"], "must be usb:DEVICE@WIDTHxHEIGHT"),
         (["rehearsal.yaml"], "no such file"),
     ],

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sliplab.plugins.record.lsl import JumpRemover, Reading
+from sliplab.plugins.record.lsl import JumpRemover, LslSettings, Reading
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import lsl
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.storage.trials.store import Store
 from tests.plugins.record.lsl_clocks import available, recordings
+
+pylsl = pytest.importorskip("pylsl")
+from sliplab.plugins.record.lsl_fake import FakeLsl  # noqa: E402  (needs pylsl)
 
 pytestmark = pytest.mark.skipif(not available(), reason="needs gcc and pylsl")
 
@@ -53,3 +58,29 @@ def test_jumps_are_taken_out_at_the_sample_where_they_happened(jump_ns: int) -> 
     error_ns = np.concatenate(found) - (true_ns + true_ns // 10_000)
     assert np.abs(error_ns).max() <= remover.error_ns <= 300_000
     assert abs(remover.shift_ns - jump_ns) <= remover.error_ns
+
+
+@pytest.mark.realtime
+def test_stamps_that_fall_back_widen_the_bound_and_what_are_none_are_counted(
+    tmp_path: Path,
+) -> None:
+    fake = FakeLsl(LslSettings(name="falling"))
+    sent = 100
+    try:
+        with (
+            record([lsl(fake.address["name"], "g")], tmp_path, "lsl") as recorder,
+            recorder.trial(),
+        ):
+            for k in range(sent):
+                threading.Event().wait(0.01)  # the sensor's period
+                t_s = pylsl.local_clock() - (0.03 if k % 10 == 9 else 0.0)
+                fake._outlet.push_sample(np.array([float(k)]), np.nan if k == 5 else t_s)
+    finally:
+        fake.close()
+    (found,) = Store.open(tmp_path).campaign("lsl").recordings()
+    rows, about = found.record.streams["g"].rows, found.record.imported
+    assert rows + about.dropped["rows of g that were lost"] == sent
+    assert about.dropped["rows of g that were lost"] == 1
+    times = found.samples("g")
+    moved_ns = (times["t"] - times["stamp"]).max()
+    assert found.clocks.streams["g"].uncertainty_ns >= moved_ns > 10e6

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,23 +99,71 @@ def test_pulses_time_a_stream_and_what_shares_its_clock(tmp_path: Path, how: str
         assert np.abs(off).max() <= clock.uncertainty_ns
 
 
-@pytest.mark.parametrize(
-    ("seeds", "stated_ms", "why"),
-    [((3, 4), 0.1, "pulses"), ((3, 3), None, "times of box may be off is not stated")],
-)
 def test_without_common_pulses_arrivals_bound_the_clock_and_the_record_says_so(
-    tmp_path: Path, seeds: tuple[int, int], stated_ms: float | None, why: str
+    tmp_path: Path,
 ) -> None:
-    found = recorded(tmp_path, "state", seeds, stated_ms)
+    found = recorded(tmp_path, "state", (3, 4), 0.1)
     assert "daq" in found.clocks.refused or found.clocks.streams["daq"].grade == "host time"
     (said,) = [note for note in found.record.imported.warnings if "by pulses" in note]
-    assert why in said
+    assert "pulses" in said
 
 
-@pytest.mark.parametrize("names", [("daq",), ("box", "daq"), ("daq", "box", "box"), ("a", "box")])
-def test_streams_that_pulses_cannot_time_are_refused(
-    tmp_path: Path, names: tuple[str, ...]
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (("daq",), "must be two or more different sensors"),
+        (("box", "daq"), "box has no clock|pulses = box"),
+        (("daq", "box", "box"), "must be two or more different sensors"),
+        (("a", "box"), "must be two or more different sensors"),
+        (("daq", "unsure"), "must say how far its times may be off"),
+        (("daq", "codes"), "have the columns state and id"),
+        (("glove", "box"), "have the columns none and state"),
+        ("daq,box", "must be a tuple of names"),
+    ],
+)
+def test_streams_that_pulses_cannot_time_are_refused_before_anything_is_recorded(
+    tmp_path: Path, names: Any, said: str
 ) -> None:
-    sources = [push("daq", {"state": ""}, clock="own"), push("box", {"state": ""})]
-    with pytest.raises(InputError, match="pulses"):
+    sources = [
+        push("daq", {"state": ""}, clock="own"),
+        push("box", {"state": ""}, uncertainty_ms=1),
+        push("unsure", {"state": ""}),
+        push("codes", {"id": ""}, uncertainty_ms=1),
+        push("glove", {"pull": "N"}, clock="own"),
+    ]
+    with pytest.raises(InputError, match=said):
         record(sources, tmp_path, "pulses", pulses=names).__enter__()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 400.0])
+def test_rows_that_come_later_than_their_delay_are_refused_by_pulses(
+    tmp_path: Path, late_ms: float
+) -> None:
+    """Arrivals alone cannot know how late all of them are."""
+    own = edges("state", np.random.default_rng(3))
+    sources = [
+        push("daq", {"state": ""}, clock="own"),
+        push("box", {"state": ""}, uncertainty_ms=0.1),
+        push("told", {"state": ""}, clock="own", delay_ms=1000),
+    ]
+    with (
+        record(sources, tmp_path, "late", pulses=("daq", "box", "told")) as recorder,
+        recorder.trial() as trial,
+    ):
+        first, sent = time.monotonic_ns(), 0
+        while sent < len(own[0]):
+            threading.Event().wait(0.005)  # the streams' period
+            end = int(np.searchsorted(own[0], time.monotonic_ns() - first - 1e6 * late_ms))
+            for name in ("daq", "box", "told"):
+                t_ns = first + own[0][sent:end] - APART_NS * (name != "box")
+                trial.push(name, t_ns, own[1][sent:end])
+            sent = end
+    (recording,) = Store.open(tmp_path).campaign("late").recordings()
+    found = recording.clocks
+    if late_ms:
+        assert "they put it" in found.refused["daq"]
+        assert "do rows come later than delay_ms" in found.refused["daq"]
+    for name in found.streams.keys() & {"daq", "told"}:
+        off = found.streams[name].map.to_reference(first - APART_NS) - first
+        assert abs(off) <= found.streams[name].uncertainty_ns, name

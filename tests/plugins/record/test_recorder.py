@@ -5,15 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sliplab
-from sliplab.plugins.record.recorder import RecordedTrial, level, record
+from sliplab.plugins.record.recorder import RecordedTrial, levels, record
 from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.lock import Locked
+from sliplab.storage.trials.store import Store
 from tests.plugins.record.recordings import SIZE, check_rows, feed, sources
 
 
@@ -85,10 +87,8 @@ def test_blocks_at_100_khz_from_several_threads_are_all_there(tmp_path: Path) ->
         for thread in threads:
             thread.join(60)
     found = sliplab.open_store(tmp_path).trial(trial.id).recording
-    late = found.record.devices["pull"]["counts"]["late"]
-    assert found.record.streams["pull"].rows + late == 2 * blocks * rows
-    if late:
-        assert found.record.imported.dropped == {"rows of pull that were lost": late}
+    assert found.record.streams["pull"].rows == 2 * blocks * rows
+    assert not found.record.imported.dropped
     assert (np.diff(found.samples("pull")["t"]) >= 0).all()
 
 
@@ -189,4 +189,74 @@ def test_settings_of_the_analysis_are_those_of_an_adapter(tmp_path: Path) -> Non
 def test_a_condition_has_its_unit_in_its_name(
     name: str, value: object, expected: tuple[str, str]
 ) -> None:
-    assert level(name, value) == expected
+    assert levels({name: value}) == dict([expected])
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [{"": 1}, {"a b": 1}, {"x/y": 1}, {"grip_n": 2, "grip": 3}, {"x": 10**400}, {"x": None}],
+    ids=str,
+)
+def test_conditions_that_say_nothing_or_two_things_are_refused(condition: Any) -> None:
+    with pytest.raises(InputError):
+        levels(condition)
+
+
+def test_values_are_those_of_the_moment_they_were_pushed(tmp_path: Path) -> None:
+    """A program may use its buffers again."""
+    t_ns, values = np.zeros(10, np.int64), np.zeros(10)
+    with (
+        record([push("pull", {"fx": "N", "fy": "N"})], tmp_path, "same") as recording,
+        recording.trial(),
+    ):
+        for step in range(20):
+            t_ns[:], values[:] = time.monotonic_ns(), step
+            recording.sources[0].device.push(t_ns, values, values)
+    (found,) = Store.open(tmp_path).campaign("same").recordings()
+    np.testing.assert_array_equal(found.samples("pull")["fx"], np.repeat(np.arange(20.0), 10))
+
+
+@pytest.mark.parametrize(
+    "value", [None, "x", b"3", 1 + 2j, 2**60 + 1, -(2**60), 10**400, [[1], [1, 2]]], ids=str
+)
+def test_values_that_are_no_numbers_or_would_be_rounded_are_refused(value: object) -> None:
+    source = push("pull", {"fx": "N", "fy": "N"})
+    with pytest.raises(InputError, match="fx"):
+        source.device.push(None, value, 1.0)
+
+
+@pytest.mark.parametrize("pixel", [1.5, float("nan"), "1", None])
+def test_pixels_of_events_are_whole_numbers(pixel: object) -> None:
+    source = push("events", events_px=(8, 4))
+    with pytest.raises(InputError, match="events: x"):
+        source.device.push(None, pixel, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"t_ns": 1.5}, {"t_ns": True}, {"t_ns": "5"}, {"t_ns": 2**70}]
+    + [{"uncertainty_ms": value} for value in (-1, float("nan"), float("inf"), "x")],
+    ids=str,
+)
+def test_wrong_marks_are_refused(tmp_path: Path, wrong: Any) -> None:
+    with (
+        record([push("pull", {"fx": "N"})], tmp_path, "marks") as recording,
+        recording.trial() as trial,
+        pytest.raises(InputError, match=f"mark: {next(iter(wrong))}"),
+    ):
+        trial.mark("slip", **wrong)
+    (found,) = Store.open(tmp_path).campaign("marks").recordings()
+    assert not found.record.imported.marks
+
+
+def test_a_stream_is_recorded_once_and_has_a_name_of_its_own(tmp_path: Path) -> None:
+    pull = push("pull", {"fx": "N"}, clock="ptp", uncertainty_ms=1)
+    with (
+        record([pull], tmp_path / "a", "one"),
+        pytest.raises(InputError, match="is being recorded already"),
+    ):
+        record([pull], tmp_path / "b", "two").__enter__()
+    with pytest.raises(InputError, match="readings of the clock of pull"):
+        record([pull, push("pull_clock", {"a": ""})], tmp_path / "b", "two").__enter__()
+    with record([pull], tmp_path / "b", "two"):
+        pass

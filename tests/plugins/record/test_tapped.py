@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,14 +72,29 @@ def test_without_a_common_tap_the_arrivals_bound_the_clock_and_the_record_says_s
     assert any("by taps: A shows 2 taps, B 1" in note for note in found.record.imported.warnings)
 
 
-def test_a_tap_that_contradicts_the_arrivals_is_not_believed(tmp_path: Path) -> None:
+def test_where_taps_and_arrivals_contradict_each_other_neither_is_believed(tmp_path: Path) -> None:
     found = recorded(tmp_path, [0.5], [1.2], 0.8)
-    assert found.clocks.streams["glove"].grade == "host time"
-    assert any("where its arrivals put it" in note for note in found.record.imported.warnings)
+    assert "glove" not in found.clocks.streams
+    assert "from where its arrivals do: one of both is wrong" in found.clocks.refused["glove"]
 
 
-@pytest.mark.parametrize("tap", [("glove", "glove"), ("pull", "glove"), ("glove", "none")])
-def test_what_cannot_be_aligned_by_taps_is_refused(tmp_path: Path, tap: tuple[str, str]) -> None:
-    sources = [push("glove", {"a": "m/s2"}, clock="own"), push("pull", {"f": "N"})]
-    with pytest.raises(InputError, match="tap"):
+@pytest.mark.parametrize(
+    ("tap", "said"),
+    [
+        (("glove", "glove"), "must be two different sensors of glove, pull, hand"),
+        (("pull", "glove"), "has no clock of its own"),
+        (("glove", "none"), "must be two different sensors"),
+        (("glove", "pull", "hand"), "must be two different sensors"),
+        (("glove", "hand"), "must say how far its times may be off"),
+        ("glove,pull", "must be a tuple of names"),
+    ],
+)
+def test_what_cannot_be_aligned_by_taps_is_refused(tmp_path: Path, tap: Any, said: str) -> None:
+    sources = [
+        push("glove", {"a": "m/s2"}, clock="own"),
+        push("pull", {"f": "N"}, uncertainty_ms=1),
+        push("hand", {"f": "N"}),
+    ]
+    with pytest.raises(InputError, match=f"tap.*{said}"):
         record(sources, tmp_path, "taps", tap=tap).__enter__()
+    assert not list(tmp_path.iterdir())

@@ -13,7 +13,8 @@ import pytest
 
 from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
-from sliplab.plugins.record.sources import SHARED, columns, push
+from sliplab.plugins.record.shared_clock import SHARED, now_ns
+from sliplab.plugins.record.sources import columns, push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.recording import Recording
@@ -23,6 +24,11 @@ STEPS, STEP_S, STATED_MS = 40, 0.01, 2.0
 S = 1_000_000_000
 STAMPS: dict[str, Callable[[int, int, int], int]] = {
     "right": lambda t, first, k: t,
+    "pushed_late": lambda t, first, k: t - S // 4,
+    "half_as_fast": lambda t, first, k: (t + first) // 2,
+    "twice_as_fast": lambda t, first, k: 2 * t - first,
+    "an_hour_ago": lambda t, first, k: t - 3600 * S,
+    "in_an_hour": lambda t, first, k: t + 3600 * S,
     "back_in_mid_trial": lambda t, first, k: t - 5 * S * (k > STEPS // 2),
     "leap_second": lambda t, first, k: t - S * (k > STEPS // 2),
     "ahead_in_mid_trial": lambda t, first, k: t + 5 * S * (k > STEPS // 2),
@@ -45,11 +51,11 @@ BELIEVED = {
     # what is only another zero, or another rate below the allowed drift
     "own": {
         *("right", "tai_for_utc", "utc_for_tai", "smeared", "another_epoch", "from_zero"),
+        *("pushed_late", "an_hour_ago", "in_an_hour"),
     },
     "ptp": {"right"},
     "utc": {"right"},
-    # rows may be pushed long after they were measured
-    "host": {"right", "constant"},
+    "host": {"right", "pushed_late"},
 }
 AT_ONCE = {
     "host": {"another_epoch", "far_future", "far_past"},
@@ -57,14 +63,19 @@ AT_ONCE = {
 """Stamps more than a day from the host's clock are errors of `push`."""
 
 
+def source_ns(clock: str) -> int:
+    """A right clock of a source."""
+    return now_ns(clock) if clock in SHARED else time.monotonic_ns()
+
+
 def pushed(trial_push: Callable[..., None], clock: str) -> dict[str, list[int]]:
     """Push the rows of all streams in real time; return the stamps that were taken, by stream."""
     taken: dict[str, list[int]] = {name: [] for name in STAMPS}
-    first = time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC))
+    first = source_ns(clock)
     for k in range(STEPS):
         threading.Event().wait(STEP_S)  # the sensor's period
         for name, stamp in STAMPS.items():
-            t_ns = stamp(time.clock_gettime_ns(SHARED.get(clock, time.CLOCK_MONOTONIC)), first, k)
+            t_ns = stamp(source_ns(clock), first, k)
             try:
                 trial_push(name, t_ns, float(k))
             except InputError:
@@ -161,11 +172,11 @@ def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
 ) -> None:
     """A file of events is in the order of time, so that what falls back cannot be stored."""
     source = push("events", events_px=(64, 48), clock="ptp", uncertainty_ms=STATED_MS)
-    first = time.clock_gettime_ns(SHARED["ptp"])
+    first = now_ns("ptp")
     with record([source], tmp_path, "stamps") as recorder, recorder.trial() as trial:
         for k in range(STEPS):
             threading.Event().wait(STEP_S)  # the camera's period
-            t_ns = STAMPS[wrong](time.clock_gettime_ns(SHARED["ptp"]), first, k)
+            t_ns = STAMPS[wrong](now_ns("ptp"), first, k)
             trial.push("events", t_ns // 1000, 1, 2, 1)
     assert verify(str(tmp_path))["ok"]
     (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
@@ -177,3 +188,35 @@ def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
     else:
         assert "events" in recording.clocks.refused
         assert not recording.record.quality.passed
+
+
+@pytest.mark.realtime
+def test_host_stamps_of_cameras_are_held_against_their_arrival(tmp_path: Path) -> None:
+    wrong = ["an_hour_ago", "in_an_hour", "twice_as_fast", "half_as_fast", "ahead_in_mid_trial"]
+    names = {"frames": wrong[0], "events": wrong[1], **{each: each for each in STAMPS}}
+    names = {n: each for n, each in names.items() if each in {*wrong, "right", "pushed_late"}}
+    image = np.zeros((4, 8), np.uint8)
+    sources = [push("events", events_px=(8, 4))]
+    sources += [push(name, frames_px=(8, 4)) for name in names if name != "events"]
+    sources += [push(f"e_{name}", events_px=(8, 4)) for name in names if name in STAMPS]
+    with record(sources, tmp_path, "stamps") as recorder, recorder.trial() as trial:
+        first = time.monotonic_ns()
+        for k in range(3 * STEPS):
+            threading.Event().wait(STEP_S)  # the cameras' period
+            for name, each in names.items():
+                t_ns = STAMPS[each](time.monotonic_ns(), first, k)
+                if name != "events":
+                    trial.push(name, t_ns, image)
+                if name not in {"events", "frames"}:
+                    trial.push(f"e_{name}", t_ns // 1000, 1, 2, 1)
+            trial.push(
+                "events", STAMPS[names["events"]](time.monotonic_ns(), first, k) // 1000, 1, 2, 1
+            )
+    assert verify(str(tmp_path))["ok"]
+    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    right = {"right", "pushed_late", "e_right", "e_pushed_late"}
+    found = {name for name in recording.clocks.streams if not name.endswith("_clock")}
+    assert found == right
+    assert recording.clocks.refused.keys() == {source.name for source in sources} - right
+    assert "fall behind their arrival by 5" in recording.clocks.refused["half_as_fast"]
+    assert recording.record.quality.gates.keys() == {"clock_frames", "clock_events"}

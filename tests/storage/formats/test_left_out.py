@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.flows.verify import verify as verify_store
 from sliplab.storage.files import safe_name
 from sliplab.storage.formats import import_trials as import_module
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
@@ -32,7 +33,7 @@ from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, sha256
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import failed_gates, verify
+from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.plugins.formats.test_lerobot import foreign
 from tests.storage.formats.adapters import SLIDES, bring, slides
@@ -512,7 +513,7 @@ def test_times_and_frames_that_cannot_be_meant_fail_their_gate(tmp_path: Path, c
     found = _one(tmp_path / "store", tmp_path / name)
     assert set(found.record.quality.gates) == gates
     assert found.record.quality.passed == (not gates)
-    assert bool(failed_gates(Store.open(tmp_path / "store"))) == bool(gates)
+    assert bool(verify_store(str(tmp_path / "store")).get("failed_gates")) == bool(gates)
 
 
 def test_trials_that_fail_their_gates_are_in_no_part_of_a_split(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+from sliplab.flows.verify import verify as verify_store
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Stream, Aedat4Writer
@@ -21,7 +22,7 @@ from sliplab.storage.schema.trial import Lost
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import salvaged, verify
+from sliplab.storage.trials.verify import verify
 from tests.storage.formats.recordings import (
     CHECKED,
     COUNT,
@@ -282,7 +283,7 @@ def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
     assert f"{lost['unread_bytes']:,} bytes were not read" in text
     (recording,) = store.campaign("theirs").recordings()
     assert [f"a.aedat4: {one}" for one in recording.record.imported.warnings] == [text]
-    assert salvaged(store) == ["theirs/a"]
+    assert verify_store(str(store.folder))["salvaged"] == ["theirs/a"]
     assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]
     assert catalogue(store)[UNREAD].tolist() == [lost["unread_bytes"]]  # from the index
     found = trials_in(path, "aedat4", salvage=True)
