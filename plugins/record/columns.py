@@ -103,10 +103,16 @@ class ColumnsSettings(DriverSettings):
 
 
 class ColumnsSensor:
-    """A `Sensor` that reads rows of numbers in a thread."""
+    """A `Sensor` that reads rows of numbers in a thread.
+
+    Attributes:
+        keeps_rows: rows whose times fall back are read, too; a fit refuses their clock. If not,
+            they are a fault.
+    """
 
     def __init__(self, settings: ColumnsSettings) -> None:
         self._settings = settings
+        self.keeps_rows = settings.shared_clock is not None
         self.kind = table_kind(settings.stored)
         self._buffer = StreamBuffer(f"{DEVICE} {settings.place}", settings.stall_s, 256.0)
         self._read: Callable[[], bytes] = bytes
@@ -185,8 +191,8 @@ class ColumnsSensor:
         t_ns = host if times is None else times
         part = {"t": t_ns, "host": host, **{name: by_name[name] for name in settings.stored}}
         self.received += len(values)
-        # where the device's clock falls back, its fit says so
-        self._buffer.add("rows", part, host, values.nbytes)
+        order = host if self.keeps_rows else t_ns
+        self._buffer.add("rows", part, order, values.nbytes)
 
     def _parse(self, data: bytes) -> tuple[list[Any], bytes]:
         """Return the whole rows in some bytes, and what is left of them."""

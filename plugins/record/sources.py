@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from sliplab.plugins.record.columns import ColumnsSensor
 from sliplab.plugins.record.pushed import PushedStream
 from sliplab.plugins.record.shared_clock import SHARED, doubt, now_ns
 from sliplab.plugins.record.table import rows
@@ -459,6 +460,8 @@ def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
     if isinstance(driver, ForceSensorDriver) and driver.of_arm:
         raise InputError(name, "driver", driver.name, "measures through an arm, which is not there")
     made = driven_stream(name, stream, None, plate)  # type: ignore[arg-type]
+    if isinstance(made.device, ColumnsSensor):
+        made.device.keeps_rows = True
     by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
     locks = driver.locks(stream.device)
     if (shared := getattr(stream.device, "shared_clock", None)) is not None:
