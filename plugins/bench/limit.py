@@ -5,6 +5,9 @@ and without it. Both are means over `DRAWN` simulations of the camera; without t
 on to be loaded as before. Events are taken as Poisson. The observer sums the logarithm of the
 likelihood ratio, as Page's test does, and is certain at ``ln(steps between false alarms)``: its
 mean time to a false alarm is then at least as long (Lorden 1971, theorem 2).
+
+It expects the slip at any moment. A detector that was trained knows that slip comes while markers
+move, which is a small part of the time, and can be certain earlier.
 """
 
 from __future__ import annotations
