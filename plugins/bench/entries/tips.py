@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from sliplab.analysis.detectors.alarms import SceneEvidence, level_at
-from sliplab.analysis.detectors.detector import Cost, Scene
+from sliplab.analysis.detectors.detector import Cost, DetectorError, Scene
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.papillae import BIN_US, FEWEST_EVENTS, GAP_MS, MEMORY_MS, Papillae
 from sliplab.plugins.bench.definition import DEFINITION, ScenePart, Size
@@ -153,7 +153,7 @@ class TipNetwork(Papillae):
         self._odds = np.full(SMOOTHED_MS - 1, LOWEST)
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
-        """See `Detector`."""
+        """See `Detector`. Raises DetectorError: too few places move in the scenes, or none slip."""
         none = ScenePart(0, 0, 0)
         size = Size(none, none, none, self._disturbed)
         drawn = nuisance_scenes(size, NUISANCE_SEED, NUISANCE_WORLDS)
@@ -162,6 +162,14 @@ class TipNetwork(Papillae):
         rng = np.random.default_rng(self._seed)
         self._weights, self._least = None, LOWEST
         samples = [one for scene in [*scenes, *others] for one in self._samples(scene, rng)]
+        self._wanted, self._seen = set(), []
+        slips = sum(slip for _, slip in samples)
+        if not 0 < slips < len(samples):
+            raise DetectorError(
+                f"{self.settings.fewest_places} papillae move at once in {len(samples) - slips} "
+                f"milliseconds before the slip and {slips} after it, of {len(scenes)} scenes; some "
+                "of both must train it: does the sensor show single markers?"
+            )
         net = fitted(samples, self._seed)
         self._weights = [one.detach().numpy() for one in net.parameters()]
         held_out = disturbed[::HELD_OUT]
@@ -188,7 +196,12 @@ class TipNetwork(Papillae):
         return Cost(operations=20.0 * of_place + of_all, memory_bytes=4 * weights)
 
     def _advance(self, first: int, value: F64) -> None:
-        """See `Papillae`; the evidence is the network's in place of it."""
+        """See `Papillae`; the evidence is the network's in place of it.
+
+        Raises DetectorError: it is not trained.
+        """
+        if self._weights is None and not self._wanted:
+            raise DetectorError("is not trained")
         super()._advance(first, value)
         odds = np.full(len(value), LOWEST)
         for k, tested in enumerate(value.tolist()):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sliplab.analysis.detectors.detector import Scene, Slip
+from sliplab.analysis.detectors.detector import DetectorError, Scene, Slip
 from sliplab.analysis.detectors.feeding import feed, steady
 from sliplab.analysis.detectors.papillae import GAP_MS, MEMORY_MS
 from sliplab.plugins.bench.entries import tips
@@ -19,6 +19,7 @@ from sliplab.plugins.bench.entries.tips import (
     inputs_of,
     log_odds,
 )
+from sliplab.storage.streams import EventChunk
 from tests.analysis.detectors import test_papillae as made
 
 PLACES = 12
@@ -130,6 +131,17 @@ def test_evidence_is_the_lowest_where_nothing_moves(network: TipNetwork) -> None
     still = made.drawn(rng, lambda t: np.zeros((len(t), len(made.CENTRES))))
     scene = Scene("still", still, made.WIDTH, made.HEIGHT, END_US, Slip(END_US, END_US, END_US))
     assert (feed(network, scene).value == tips.LOWEST).all()
+
+
+def test_what_cannot_train_it_is_named() -> None:
+    still = Scene("still", EventChunk.empty(), 640, 480, END_US, Slip(SLIP_US, SLIP_US, END_US))
+    with pytest.raises(DetectorError, match="in 0 milliseconds before the slip and 0 after"):
+        TipNetwork().train([still], [])
+
+
+def test_without_training_it_does_not_keep_silent() -> None:
+    with pytest.raises(DetectorError, match="not trained"):
+        feed(TipNetwork(), slide(50))
 
 
 def test_the_cost_is_that_of_the_layers() -> None:
