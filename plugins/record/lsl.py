@@ -188,7 +188,7 @@ class LslStream:
         self._reads: list[tuple[int, int, int, int]] = []
         self._waiting = self.lost = self.malformed = self.received = 0
         self._last_t: int | None = None
-        self._moved_ns = self._told_ns = 0  # by which stamps that fell back were changed
+        self._moved_ns = self._stated_ns = 0  # by which stamps that fell back were changed
         self._last_read: list[tuple[int, int, int, int]] = []
         self._silence, self._unread_clock = StallTimer(), StallTimer()
 
@@ -282,9 +282,9 @@ class LslStream:
         """Return the readings of the clock since the last call; their times are without jumps."""
         with self._lock:
             reads, self._reads = self._reads, []
-        if not reads and self._moved_ns > self._told_ns:  # no reading may come that could say so
+        if not reads and self._moved_ns > self._stated_ns:  # no reading may come that could say so
             reads = self._last_read
-        self._last_read, self._told_ns = reads[-1:] or self._last_read, self._moved_ns
+        self._last_read, self._stated_ns = reads[-1:] or self._last_read, self._moved_ns
         columns = np.array(reads, np.int64).reshape(-1, 4).T
         columns[3] += self._moved_ns
         return rows(CLOCK, "", dict(zip(CLOCK.columns, columns, strict=True)))
