@@ -292,7 +292,7 @@ class RecordedTrial:
         Raises:
             InputError: an argument. RuntimeError: the trial has ended.
         """
-        if not name or not name.isprintable() or len(name) > 100:
+        if not isinstance(name, str) or not (name and name.isprintable()) or len(name) > 100:
             raise InputError("mark", "", name, "must be printable text of 100 characters at most")
         if t_ns is not None and (
             isinstance(t_ns, bool)

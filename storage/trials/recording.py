@@ -328,7 +328,9 @@ class Recording:
         known = self.clocks.devices()
         if device not in known:
             names = ", ".join(sorted(known)) or "none"
-            raise StoreError(f"{self.folder}: the trial has no clock '{device}'; it has: {names}")
+            why = self.clocks.refused.get(device)
+            text = f"the trial has no clock '{device}'" + (f", since {why}" if why else "")
+            raise StoreError(f"{self.folder}: {text}; it has: {names}")
         return known[device].map
 
     def events(

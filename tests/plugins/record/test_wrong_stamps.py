@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 import time
@@ -16,6 +17,7 @@ from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.shared_clock import SHARED, now_ns
 from sliplab.plugins.record.sources import columns, push
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -162,7 +164,9 @@ def test_lines_with_wrong_stamps_of_a_shared_clock(tmp_path: Path, wrong: str) -
     assert recording.record.streams["g"].rows == STEPS - malformed
     assert ("g" in recording.clocks.streams) == (wrong in {"nan_once", "infinite_once"})
     if wrong in {"back", "tai", "constant"}:
-        assert recording.clocks.refused["g"]
+        why = recording.clocks.refused["g"]
+        with pytest.raises(StoreError, match=re.escape(f"no clock 'g', since {why}")):
+            recording.clock("g")
 
 
 @pytest.mark.realtime
