@@ -25,7 +25,7 @@ from sliplab.plugins.bench.definition import DEFINITION, ScenePart, Size
 from sliplab.plugins.bench.scenes import nuisance_scenes, simulated
 
 SPANS_MS = (3, 10, 30)
-OF_PLACE, OF_ALL = 2 * len(SPANS_MS) + 3, len(SPANS_MS) + 4
+OF_PLACE, OF_ALL = 2 * len(SPANS_MS) + 3, len(SPANS_MS) + 5
 """Inputs of a place, and of all."""
 HIDDEN = 16
 LARGEST = 6.0
@@ -43,7 +43,7 @@ LOWEST = -30.0
 """Log odds of slip while nothing moves."""
 NUISANCE_SEED = 2**31 + DEFINITION.train_seed
 """No seed of a test is as large."""
-NUISANCE_WORLDS, DISTURBED = "hard", 12
+NUISANCE_WORLDS, DISTURBED = "hard", 24
 """Worlds of the scenes with nuisances, and how many there are with each."""
 HELD_OUT, ALLOWED = 3, 1
 """One of so many scenes with nuisances does not train: the least evidence has so many false alarms
@@ -65,12 +65,13 @@ class Inputs:
     whole: F32
 
 
-def inputs_of(counts: I64, noise: F64, dispersion: float, tested: float) -> Inputs:
+def inputs_of(counts: I64, noise: F64, dispersion: float, one_way: float, tested: float) -> Inputs:
     """Return the inputs of the last of some milliseconds.
 
     Args:
         counts: events by millisecond and place, `MEMORY_MS` + `GAP_MS` before the last one.
-        noise: events a millisecond of each place. tested: the evidence of `Papillae`.
+        noise: events a millisecond of each place. one_way: by how much each cell has one polarity.
+        tested: the evidence of `Papillae`.
     """
     memory = counts[:MEMORY_MS].sum(axis=0)
     moving = memory >= FEWEST_EVENTS
@@ -78,7 +79,7 @@ def inputs_of(counts: I64, noise: F64, dispersion: float, tested: float) -> Inpu
     total = memory.sum() + 1.0
     places = [np.log(memory + 1.0) / 5, np.log((memory + 1.0) * len(memory) / total)]
     places.append(np.minimum(noise[moving] * MEMORY_MS / (memory + 1.0), 1.0))
-    whole = [len(memory) / 20, np.log(dispersion), np.log(total) / 5, tested / 10]
+    whole = [len(memory) / 20, np.log(dispersion), one_way, np.log(total) / 5, tested / 10]
     for span_ms in SPANS_MS:
         seen = counts[-span_ms:].sum(axis=0)[moving]
         expected = seen.sum() * memory / total
@@ -226,7 +227,7 @@ class TipNetwork(Papillae):
             return None
         counts = self._counts[at : at + MEMORY_MS + GAP_MS + 1]
         tested = tested if self._joined else 0.0
-        seen = inputs_of(counts, self._noise, self._dispersion(), tested)
+        seen = inputs_of(counts, self._noise, self._dispersion(), self._one_way, tested)
         return seen if len(seen.places) >= fewest else None
 
 

@@ -61,7 +61,7 @@ def test_motion_of_all_is_no_news_of_a_place() -> None:
     counts = np.tile(np.arange(10, 10 + PLACES), (ROWS, 1))
     for faster in (1, 2):
         counts[-40:] = faster * np.arange(10, 10 + PLACES)
-        seen = inputs_of(counts, np.zeros(PLACES), 1.0, 0.0)
+        seen = inputs_of(counts, np.zeros(PLACES), 1.0, 1.0, 0.0)
         assert seen.places.shape == (PLACES, OF_PLACE)
         assert seen.whole.shape == (OF_ALL,)
         assert seen.places[:, 3:] == pytest.approx(0.0, abs=0.02)
@@ -70,7 +70,7 @@ def test_motion_of_all_is_no_news_of_a_place() -> None:
 def test_a_silent_place_stands_out_in_each_span() -> None:
     counts = steady_counts(np.random.default_rng(1))
     counts[-30:, 4] = 0
-    seen = inputs_of(counts, np.zeros(PLACES), 1.0, 0.0).places
+    seen = inputs_of(counts, np.zeros(PLACES), 1.0, 1.0, 0.0).places
     for k in range(len(SPANS_MS)):
         assert seen[:, 3 + 2 * k].argmin() == 4
     assert seen[4, -2] < -4, "log of half an event against about 80 expected ones"
@@ -82,14 +82,14 @@ def test_the_order_of_places_does_not_matter() -> None:
     counts, order = steady_counts(rng), rng.permutation(PLACES)
     counts[-20:, :2] = 0
     noise = rng.uniform(0, 0.1, PLACES)
-    one = inputs_of(counts, noise, 1.3, 0.0)
-    other = inputs_of(counts[:, order], noise[order], 1.3, 0.0)
+    one = inputs_of(counts, noise, 1.3, 1.0, 0.0)
+    other = inputs_of(counts[:, order], noise[order], 1.3, 1.0, 0.0)
     net = weights(TipNet())
     assert log_odds(net, other) == pytest.approx(log_odds(net, one), abs=1e-4)
 
 
 def test_one_millisecond_has_the_log_odds_of_the_layers() -> None:
-    seen = inputs_of(steady_counts(np.random.default_rng(4)), np.zeros(PLACES), 2.0, 3.0)
+    seen = inputs_of(steady_counts(np.random.default_rng(4)), np.zeros(PLACES), 2.0, 0.5, 3.0)
     net, places = TipNet(), torch.from_numpy(seen.places)[None]
     expected = net(places, torch.from_numpy(seen.whole)[None], torch.ones(1, PLACES))
     assert log_odds(weights(net), seen) == pytest.approx(float(expected.detach()), abs=1e-4)
@@ -146,6 +146,6 @@ def test_without_training_it_does_not_keep_silent() -> None:
 
 def test_the_cost_is_that_of_the_layers() -> None:
     cost = TipNetwork().cost()
-    weights = 16 * 16 + 16 + 16 * 16 + 16 + 39 * 16 + 16 + 16 + 1
+    weights = 17 * 16 + 16 + 16 * 16 + 16 + 40 * 16 + 16 + 16 + 1
     assert cost.memory_bytes == 4 * weights
-    assert cost.operations == 20 * (16 * 16 + 16 * 16) + 39 * 16 + 16
+    assert cost.operations == 20 * (17 * 16 + 16 * 16) + 40 * 16 + 16
