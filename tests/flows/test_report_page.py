@@ -85,6 +85,7 @@ INK = """() => [document.body, document.querySelector('#answer svg text')].map(
 """Colours of the ground and of a figure's text."""
 
 
+@pytest.mark.long
 def test_first_screen_answers_in_light_and_dark(browser: Any, folder: Path) -> None:
     grounds, inks = set(), set()
     for scheme in ("light", "dark"):

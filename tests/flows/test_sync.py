@@ -108,6 +108,7 @@ def test_a_second_run_does_nothing(store: Store) -> None:
     assert page.exists()
 
 
+@pytest.mark.long
 def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -78,6 +78,7 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
         assert (onset is None) == (ours == 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("margin", [0.0, 2.0])
 def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) -> None:
     """Another margin once changed the detections, and not the margin accuracy beside them."""

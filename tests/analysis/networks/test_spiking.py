@@ -123,6 +123,7 @@ def test_how_often_each_layer_fires() -> None:
 grid_weights = st.integers(-3, 3)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(data=st.data())
 def test_extremes(data: st.DataObject) -> None:

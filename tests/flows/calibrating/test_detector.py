@@ -57,6 +57,7 @@ def test_the_document_has_a_schema(document: Path) -> None:
     assert check_refusals("detector", document, every=False) > 25
 
 
+@pytest.mark.long
 def test_it_says_what_so_much_holding_supports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

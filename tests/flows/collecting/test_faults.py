@@ -177,6 +177,7 @@ SEEN: list[tuple[dict[str, Any], str]] = [
 ]
 
 
+@pytest.mark.quick(6)
 @pytest.mark.parametrize(
     ("fault", "gate"), SEEN, ids=[case[0]["kind"] + "-" + case[1] for case in SEEN]
 )
@@ -242,6 +243,7 @@ def _only(campaign: Campaign) -> str:
     return str(failed["folder"])
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(
     "fault",
     [

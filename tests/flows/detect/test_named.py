@@ -107,6 +107,7 @@ def test_the_arm_stops_where_it_fails(protocol: Path) -> None:
         assert stands_clear(rigs[-1])
 
 
+@pytest.mark.long
 def test_in_its_process_it_is_the_same_and_a_hang_ends_in_time() -> None:
     rng = np.random.default_rng(1)
     t_us = np.sort(rng.integers(0, 300_000, 3000))

@@ -249,6 +249,7 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
     assert (rigs[0].position().depth_mm < 0) != stays
 
 
+@pytest.mark.long
 def test_the_command_says_what_was_lost_and_fails(
     model: Path, protocol: Path, tmp_path: Path
 ) -> None:

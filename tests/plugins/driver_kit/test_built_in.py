@@ -123,7 +123,8 @@ DEVICES = {
     "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
-FURTHER = {"ur_wrench"}  # over the connection of the arm, whose rules are tried
+# one arm and one camera at once; the wrench is on the connection of the arm, whose rules are tried
+FURTHER = {"abb", "abb_socket", "dvxplorer", "ur_wrench", "uvc"}
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,7 @@ def test_a_slide_at_1_6_mm_s_is_straight_and_at_its_speed(
     check_slide(robot_of, arm_on, 1.6, rate)
 
 
+@pytest.mark.long
 def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(robot_of: Any, arm_on: MakeArm) -> None:
     check_slide(robot_of, arm_on, 0.6, rate=5.0)  # 25 s of controller time
 
