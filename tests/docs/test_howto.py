@@ -28,6 +28,7 @@ MARKS = {
     "import-labelled-data": [pytest.mark.programs, pytest.mark.long],
     "import-old-data": [pytest.mark.long],
     "one-camera": [pytest.mark.long],
+    "record": [pytest.mark.long],
 }
 
 

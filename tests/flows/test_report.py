@@ -564,6 +564,7 @@ def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store
         assert f"{name}, the chosen network" in near
 
 
+@pytest.mark.long
 def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
     other = tmp_path / "summary.json"
     shutil.copy(store.folder / "report" / "summary.json", other)

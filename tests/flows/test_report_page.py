@@ -49,6 +49,7 @@ def browser() -> Iterator[Any]:
         yield found
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", ["index.html", "against.html"])
 @pytest.mark.parametrize("width", [1400, 390, PAPER_PX])
 def test_a_page_fits_and_is_whole(browser: Any, folder: Path, name: str, width: int) -> None:

@@ -93,6 +93,7 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
     assert expected != metrics.accuracy(kept["counts"], kept["y"], 30.0).margin
 
 
+@pytest.mark.long
 def test_each_sample_says_its_trial(two: Store) -> None:
     """The last window of no slip ends at the onset of its own trial."""
     campaigns = collected(two)

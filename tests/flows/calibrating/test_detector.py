@@ -135,6 +135,7 @@ def test_a_stop_leaves_the_arm_at_rest_and_clear(
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_a_skin_that_was_not_seen_writes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

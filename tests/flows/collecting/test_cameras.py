@@ -60,6 +60,7 @@ def only(folder: Path) -> Recording:
     return campaign.recording(*campaign.committed())
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("camera", ["events", "frames"])
 def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) -> None:
     found = only(taken[camera])

@@ -58,6 +58,7 @@ class Failing(Detector):
         return Evidence.of([until_us], [np.nan])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", ["rate", "flow"])
 def test_the_bench_says_live_what_it_says_of_the_events(
     name: str, protocol: Path, tmp_path: Path

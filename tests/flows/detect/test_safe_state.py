@@ -339,6 +339,7 @@ def test_limits_of_force_hold_for_grips(gripping: Gripping) -> None:
 # -- the network's process -------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_network_in_its_process_is_the_network_and_a_hang_ends_in_time(model: Path) -> None:
     from sliplab.analysis.detectors.network_detector import counting_of
 

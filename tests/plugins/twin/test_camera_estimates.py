@@ -168,6 +168,7 @@ def test_discs_that_sweep_give_all_numbers_of_the_picture() -> None:
     assert np.isnan(found["scan_us"])
 
 
+@pytest.mark.long
 def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
     """As where the rim of a disc passes that was not found in its place."""
     x, y = np.divmod(np.arange(400), 20)

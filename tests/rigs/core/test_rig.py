@@ -350,7 +350,7 @@ def test_a_twist_that_is_stopped_comes_straight_out_and_turns_back_in_the_next_t
     assert angle_deg(rig.arm.pose(), Pose(stood.xyz_mm, straight)) < 1e-6
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", [name for name in shipped_rigs() if name.startswith("mock")])
 def test_a_simulated_rig_is_freed_once_nobody_has_it(name: str) -> None:
     """Without the garbage collector, which sees few objects and not their megabytes."""

@@ -294,6 +294,7 @@ def test_sessions_that_differ_need_more_trials(campaigns: int) -> None:
     assert drawn(plan, pilot, Sessions(6, 1.0), 1) == apart[:1]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("collection", [{}, {"order": "adaptive"}])
 def test_sessions_without_differences_and_drift_change_nothing(collection: dict[str, Any]) -> None:
     plan = plan_of([MEDIAN], repetitions=20, **collection)
