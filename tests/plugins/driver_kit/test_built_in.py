@@ -123,8 +123,8 @@ DEVICES = {
     "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
-# one arm and one camera at once; the wrench is on the connection of the arm, whose rules are tried
-FURTHER = {"abb", "abb_socket", "dvxplorer", "ur_wrench", "uvc"}
+# one arm, camera and stream are enough for a day; the wrench is on the connection of the arm
+FURTHER = {"abb", "abb_socket", "dvxplorer", "lsl", "ur_wrench", "uvc"}
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,7 @@ def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeA
     assert not robot.moving()
 
 
+@pytest.mark.long
 def test_stop_does_not_wait_for_a_path_that_is_being_sent(abb_pair: MakeAbb) -> None:
     """And the arm does not move after it."""
     arm, robot = abb_pair()

@@ -101,6 +101,7 @@ def test_connecting_again_unlocks_nothing_and_needs_a_person_first(ur_pair: Make
     assert len(arm.progress().finished) == 1
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
     arm, robot = ur_pair(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
@@ -129,7 +130,7 @@ def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
     reconnect(arm)
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 @pytest.mark.parametrize(
     ("stage", "within_s"),
