@@ -26,9 +26,10 @@ Every millisecond:
    McCullagh & Nelder 1989, section 4.5): what was doubtful when it came stays so. The half of the
    places that differ most is left out: they may be the tips that slide. While an object brushes
    over single papillae, which shows by places with far more events than before for longer than
-   `JUMP_MS`, it is divided by `TOUCHED_SCALE` too. A tip that jumps and sticks again causes as
-   many, but for a few milliseconds: then its marker must come back before the same pixels see it
-   move, and its place is silent for so long.
+   `JUMP_MS`, it is divided by `DISTURBED_SCALE` too. So it is while the papillae move to and fro,
+   as after a knock: then the same cells have ON and OFF events. A tip that jumps and sticks again
+   causes as many, but for a few milliseconds: then its marker must come back before the same pixels
+   see it move, and its place is silent for so long.
 
 While most events of the places are OFF, the skin is unloaded, and the test is another: a place
 causes twice the events that its number of cells lets expect, and its share of ON events is `TURNED`
@@ -54,7 +55,7 @@ from sliplab.analysis.detectors.slipped_tips import SlippedTips, regions
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import EventChunk
 
-VERSION = 3
+VERSION = 4
 """Incremented when the evidence of the same events is another."""
 BIN_US = 1000
 CELLS_ACROSS = 80
@@ -86,13 +87,20 @@ TOUCHED = 20.0
 """Statistic of a pushed place from which another object touches it; slides reach about 15."""
 JUMP_MS = 20
 """Time for which a place is pushed while its tip jumps from stick to stick; objects push longer."""
-TOUCHED_MS, TOUCHED_SCALE = 300, 9.0
+TOUCHED_MS = 300
 """An object that let go pulls the papillae's motion about for so long."""
+DISTURBED_SCALE = 9.0
+"""The square of the dispersion is so much larger while an object touches or the papillae move to
+and fro."""
 LARGEST = 30.0
 """Statistic of a pushed place at which it stays, so that it counts again soon afterwards."""
 UNLOADED = 0.9
 """Share of OFF events from which the skin is unloaded. Markers that move have half, but at first
 one side of each is seen alone: up to 0.85 when ten places move."""
+ONE_WAY = 0.4
+"""By how much each cell has one polarity, under which the papillae move to and fro: a marker's edge
+that passes a cell leaves one, an edge that comes back the other. Slides have 0.93 and more, what
+rings after a knock up to 0.25."""
 TURNED = 4.0
 """Ratio of the odds of ON events where a marker turns back."""
 FEW_ON, OF_SEEN, OF_NOW = 0.05, 100.0, 5.0
@@ -155,7 +163,7 @@ class Papillae(Detector):
         self._events = np.zeros((2, cells), np.int64)
         self._place = np.full(cells, -1)
         self._rest, self._pushed, self._noise = np.zeros(0), np.zeros(0), np.zeros(0)
-        self._cells, self._unloaded = np.zeros(0), False
+        self._cells, self._unloaded, self._one_way = np.zeros(0), False, 1.0
         self._hot = np.array(self.settings.hot, np.int64)
         self._dispersions = np.full(DISPERSION_MS // PLACES_MS, np.nan)
         self._age = np.zeros(3, np.int64)
@@ -237,7 +245,8 @@ class Papillae(Detector):
             self._events, self._hot, self._shape[1], self._place, self._rest, self._pushed
         )
         self._place, self._placed_cells, self._rest, self._pushed, self._noise, self._cells = found
-        self._unloaded = _share_off(self._events, self._placed_cells) >= UNLOADED
+        share_off, self._one_way = _polarities(self._events, self._placed_cells)
+        self._unloaded = share_off >= UNLOADED
         shape = MEMORY_MS + GAP_MS + PLACES_MS, len(self._noise)
         self._counts, self._back = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
         # single milliseconds only where the memory will begin and end: the sum of the others counts
@@ -304,7 +313,8 @@ class Papillae(Detector):
             back = self._back[part]
             _advance_unloaded(counts, back, noise, self._cells, pushed, scale, fewest, value)
         else:
-            _advance(counts, noise, rest, pushed, self._age, scale**2, fewest, value)
+            doubt = scale**2 * (DISTURBED_SCALE if self._one_way < ONE_WAY else 1.0)
+            _advance(counts, noise, rest, pushed, self._age, doubt, fewest, value)
         self._found_slip |= bool(value.any())
 
     def _dispersion(self) -> float:
@@ -344,13 +354,18 @@ def _replace_block(events: I64, blocks: npt.NDArray[np.uint32], block: int) -> N
 
 
 @njit(cache=True, nogil=True)
-def _share_off(events: I64, cells: I64) -> float:
-    """Return the share of OFF events in some cells; 0 without events."""
-    seen, on = 0, 0
+def _polarities(events: I64, cells: I64) -> tuple[float, float]:
+    """Return the share of OFF events in some cells, and by how much each cell has one polarity.
+
+    The second is 1 where each cell has ON events alone or OFF events alone, and 0 where each has as
+    many of both. Without events there are 0 and 1.
+    """
+    seen, on, more = 0, 0, 0
     for cell in cells:
         seen += events[0, cell]
         on += events[1, cell]
-    return 1 - on / seen if seen else 0.0
+        more += abs(2 * events[1, cell] - events[0, cell])
+    return (1 - on / seen, more / seen) if seen else (0.0, 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -520,7 +535,7 @@ def _advance(
         else:
             all_n, all_w = n[others].sum(), memory[others].sum()
             weight = min(all_w / MEMORY_MS / max(all_n, 1), 1.0)
-            doubt = scale * (TOUCHED_SCALE if age[0] > 0 else 1.0)
+            doubt = scale * (DISTURBED_SCALE if age[0] > 0 else 1.0)
             for j in range(places):
                 if not moving[j]:
                     rest[j] = pushed[j] = 0.0

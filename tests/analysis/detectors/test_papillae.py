@@ -174,6 +174,15 @@ def test_tips_that_let_go_at_once_do_not_hide_each_other(seed: int) -> None:
     assert (value[slip_ms : slip_ms + 20] > LEVEL).any()
 
 
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("seed", range(5))
+def test_a_marker_that_comes_to_rest_while_all_swing_is_no_slip(seed: int) -> None:
+    def swinging(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.full((len(t), len(CENTRES)), 0.5)
+
+    assert evidence(drawn(np.random.default_rng(seed), one_stops, on=swinging)).max() < LEVEL
+
+
 @pytest.mark.quick(2)
 @pytest.mark.parametrize("seed", range(5))
 def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
