@@ -52,16 +52,17 @@ test-programs: $(DONE)
 test-virtual: $(DONE)
 	$(PYTEST) -n 3 --dist loadgroup --no-loadscope-reorder -m 'not realtime and not long'
 
-# fakes in real time: whole scenes, which compute, one after another; beside them the rest. A shared
+# fakes in real time: whole scenes, which compute, one after another; beside them the rest, which waits. A shared
 # machine may stop a process for longer than a device's silence: what failed must pass alone, in one of two tries.
 REALTIME := -m 'realtime and not long'
 ALONE := $(PYTEST) --last-failed --last-failed-no-failures none $(REALTIME)
 test-realtime: $(DONE)
-	$(PYTEST) -n 2 --dist loadgroup $(REALTIME) || $(ALONE) || $(ALONE)
+	$(PYTEST) -n 3 --dist loadgroup $(REALTIME) || $(ALONE) || $(ALONE)
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)
-	$(PYTEST) -m long
+	$(PYTEST) -n 2 --dist loadgroup -m 'long and not realtime'
+	$(PYTEST) -m 'long and realtime'
 
 # whole campaigns under every fault, in virtual time: hours of the rig, by as many seeds as they need
 HOURS ?= 10

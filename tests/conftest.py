@@ -11,7 +11,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -145,13 +145,19 @@ def _without_group(name: str) -> str:
     return name[:at] if at > name.rfind("]") else name  # one in brackets is a parameter's
 
 
-def pytest_collection_finish() -> None:
-    """Spare the collector all that was imported: what tests leave behind goes at once then.
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Spare the collector all that is imported: what tests leave behind goes at once then.
 
     With a million objects to look through it comes so rarely that a worker grows to gigabytes.
     """
-    gc.collect()
-    gc.freeze()
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.hookimpl(trylast=True)

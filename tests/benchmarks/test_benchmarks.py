@@ -67,6 +67,7 @@ MARKS["acquisition"] = pytest.mark.realtime
 campaigns, and `orchestration` servers."""
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in TINY])
 def test_a_benchmark_gives_what_is_promised(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

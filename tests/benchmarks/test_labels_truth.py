@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from benchmarks.labels_summary import summary, tables, verdicts
 from benchmarks.labels_truth import GLARE, NUISANCES, ROOT, check
@@ -11,6 +12,7 @@ from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 
 
+@pytest.mark.long
 def test_two_slides_against_the_truth() -> None:
     """One as the rig gives it, one with glare, hidden markers and a trembling camera."""
     plan = load_plan(ROOT / "protocols" / "kinematic.yaml")

@@ -197,6 +197,7 @@ def test_figures_are_means_over_networks_and_their_intervals_hold() -> None:
     assert nothing.figures()["gross"] is None
 
 
+@pytest.mark.long
 def test_a_hidden_rig_file_is_the_world_that_was_drawn(tmp_path: Path) -> None:
     assumed = tmp_path / "assumed.yaml"
     assumed.write_text(rig_yaml(twin_studies.ASSUMED))

@@ -21,13 +21,20 @@ NOTEBOOK = ROOT / "docs" / "howto" / "from-a-notebook.md"
 READ_WITHOUT = ROOT / "docs" / "howto" / "read-without-sliplab.md"
 INDEX = ROOT / "docs" / "howto" / "index.md"
 GUIDES = sorted(set((ROOT / "docs" / "howto").glob("[a-z]*.md")) - {NOTEBOOK, INDEX})
-WHOLE = ("write-a-driver", "add-an-analysis-step", "import-labelled-data")
-"""Guides that install a package, or go through all steps."""
+MARKS = {
+    # they install a package, or go through all steps
+    "write-a-driver": [pytest.mark.programs],
+    "add-an-analysis-step": [pytest.mark.programs, pytest.mark.long],
+    "import-labelled-data": [pytest.mark.programs, pytest.mark.long],
+    "import-old-data": [pytest.mark.long],
+    "one-camera": [pytest.mark.long],
+    "record": [pytest.mark.long],
+}
 
 
 @pytest.mark.parametrize(
     "guide",
-    [pytest.param(g, marks=pytest.mark.programs) if g.stem in WHOLE else g for g in GUIDES],
+    [pytest.param(g, marks=MARKS.get(g.stem, ())) for g in GUIDES],
     ids=lambda path: path.stem,
 )
 def test_the_guide_works_as_printed(guide: Path, checkout: Path) -> None:

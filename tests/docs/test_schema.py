@@ -92,6 +92,7 @@ EVERY = [False, pytest.param(True, marks=pytest.mark.long)]
 """One kind of nonsense at each place, or all of them."""
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("every", EVERY)
 @pytest.mark.parametrize(
     ("kind", "pattern"),

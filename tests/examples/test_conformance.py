@@ -1,4 +1,4 @@
-"""The drivers of the example packages keep the rules for drivers, on their fakes."""
+"""The package of the guide for drivers keeps the rules for drivers by its own test."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ import subprocess
 import sys
 
 import pytest
-from sliplab_prophesee import DRIVER, PropheseeSettings
 
-from sliplab.testing import conformance
 from tests.examples.conftest import EXAMPLES
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.long]
 LIMIT_S = 120
 
-test_prophesee = conformance(DRIVER, PropheseeSettings(source="stream", stall_s=0.4))
 
-
-@pytest.mark.programs
 def test_the_lab_plugin_by_its_own_test() -> None:
     package = EXAMPLES / "lab-plugin"
     done = subprocess.run(

@@ -49,6 +49,7 @@ def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     cli._added.intersection_update(added)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("subject")
 def test_command_study_and_section(ran: Ran, tmp_path: Path) -> None:
     shutil.copytree(ran[0][0].store, tmp_path / "store")

@@ -16,6 +16,7 @@ from tests.command_line import here
 from tests.conftest import ROOT
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated")
 @pytest.mark.filterwarnings("ignore:The inplace keyword in DataFrame.reset_index")
 def test_simulated_campaigns_and_a_downloaded_set_become_one_archive(

@@ -150,6 +150,7 @@ def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> 
     assert check_refusals("classes-summary", folder / "summary.json") > 12
 
 
+@pytest.mark.long
 def test_nothing_is_made_twice_and_other_methods_join(
     copied: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,6 +179,7 @@ def test_nothing_is_made_twice_and_other_methods_join(
     assert answer("report", copied.folder) == {"step": "report", "done": 0, "fresh": 1}
 
 
+@pytest.mark.long
 def test_parts_of_one_recording_may_show_several_classes(tmp_path: Path) -> None:
     store = Store.create(tmp_path / "store")
     campaign = begin_campaign(store, adapter(), simulated=True)
@@ -204,6 +206,7 @@ def test_parts_of_one_recording_may_show_several_classes(tmp_path: Path) -> None
     assert "mock rig" not in page.replace("\n", " ")
 
 
+@pytest.mark.long
 def test_a_class_without_training_recordings_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -239,6 +242,7 @@ def test_what_cannot_be_trained_is_said(
     assert not list((store.folder / "models").glob("*"))
 
 
+@pytest.mark.long
 def test_without_test_recordings_there_are_no_figures(tmp_path: Path) -> None:
     store = class_store(tmp_path / "store", trials={"train": 2, "validation": 1})
     campaigns = collected(store)

@@ -36,6 +36,7 @@ def two_seeds(ran: Ran, tmp_path_factory: pytest.TempPathFactory, rig_path: Path
     return Store.open(folder / "store")
 
 
+@pytest.mark.long
 def test_each_network_is_judged_by_the_chosen_one_s_rule(two_seeds: Store) -> None:
     campaigns = collected(two_seeds)
     found = evaluation_of(two_seeds)
@@ -54,6 +55,7 @@ def test_each_network_is_judged_by_the_chosen_one_s_rule(two_seeds: Store) -> No
     assert slides[0].latency_ms != slides[1].latency_ms
 
 
+@pytest.mark.long
 def test_spikes_of_every_network_are_kept(two_seeds: Store) -> None:
     campaigns = collected(two_seeds)
     assert evaluate(two_seeds, campaigns)["done"] == 0
@@ -73,6 +75,7 @@ def test_spikes_of_every_network_are_kept(two_seeds: Store) -> None:
     assert counted() == before
 
 
+@pytest.mark.long
 def test_the_report_shows_every_network(two_seeds: Store) -> None:
     found = evaluation_of(two_seeds)
     summary = read_summary(two_seeds)

@@ -123,6 +123,7 @@ def test_onsets_are_within_their_interval_and_close_to_those_from_frames(
     assert known >= 6
 
 
+@pytest.mark.long
 def test_tracks_are_near_the_truth(slides: list[Recording]) -> None:
     """The distance slid is the displacement in the frames, which see the tips from outside."""
     for recording in slides:
@@ -161,6 +162,7 @@ def test_lost_events_leave_the_gross_onset_right_or_in_doubt(
     assert doubted >= (1 if "long" in case else len(slides))
 
 
+@pytest.mark.long
 def test_a_camera_that_loses_a_third_of_all_events_is_still_right_or_in_doubt(
     slides: list[Recording],
 ) -> None:
@@ -173,6 +175,7 @@ def test_a_camera_that_loses_a_third_of_all_events_is_still_right_or_in_doubt(
     assert known >= 4
 
 
+@pytest.mark.long
 def test_twists_are_labelled_too(tmp_path: Path) -> None:
     """The centre turns on the spot, makes no event, and is in nobody's way."""
     store = take("rehearsal", tmp_path, "press_twist", depth=[2.8], speed=[12.0], angle=[40.0])
@@ -226,6 +229,7 @@ def test_a_reviewer_sees_the_markers_where_the_event_camera_does(unseen: Store) 
     assert shown.places(1000)[0] == pytest.approx([319.5, 239.5], abs=60.0)
 
 
+@pytest.mark.long
 def test_a_plate_that_moves_is_not_seen(tmp_path: Path) -> None:
     store = take("mock_events", tmp_path, "pilot_gravity", speed=[0.7])
     recording = next(iter(store.campaign("pilot_gravity").recordings()))

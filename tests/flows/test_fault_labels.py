@@ -123,6 +123,7 @@ def test_a_plate_that_is_stuck_gives_no_gross_slip(tmp_path: Path) -> None:
     assert label.doubts.gross is None  # it is known that there was none
 
 
+@pytest.mark.long
 def test_an_occluded_plate_leaves_a_right_label_or_none(tmp_path: Path) -> None:
     sound = one_fall(tmp_path / "sound", [])
     assert sound[0].document().doubts == OnsetDoubts(incipient=None, gross=None)

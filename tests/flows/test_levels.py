@@ -77,6 +77,7 @@ def errors_ms(found: Label, recording: Recording) -> list[float]:
     return [(a - b) / 1e6 for a, b in pairs]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [kinematic, pytest.param(gravity, marks=pytest.mark.long)])
 def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
     data = make()

@@ -25,6 +25,7 @@ def test_everything_in_it_is_sound(older: Path) -> None:
     assert len(answer("trials", older)["trials"]) == 4
 
 
+@pytest.mark.long
 def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
     before = read_json(older / "report" / "summary.json")
     labels = {path.name: read_json(path) for path in older.glob("derived/labels/small/*.json")}

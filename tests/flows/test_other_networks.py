@@ -72,6 +72,7 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
     )
 
 
+@pytest.mark.long
 def test_the_preset_by_itself_is_the_network_that_stood_beside(
     store: Store, tmp_path: Path
 ) -> None:
@@ -127,6 +128,7 @@ def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
     assert "paper preset (simulated)" in page
 
 
+@pytest.mark.long
 def test_the_kernels_say_where_they_may_differ(store: Store, tmp_path: Path) -> None:
     lab(tmp_path)
     done = here("evaluate", store.folder, "--model", tmp_path / "lab.yaml", "--engine", "fast")

@@ -78,6 +78,7 @@ def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
     pd.DataFrame(rows).to_csv(folder / "trials.csv", index=False)
 
 
+@pytest.mark.long
 def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
     here = Store.open(older_store(tmp_path / "here"))
     (item,) = collected(here)

@@ -199,6 +199,7 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
         assert line["incipient latency (ms)"] == ("" if late is None else str(late))
 
 
+@pytest.mark.long
 def test_sections_of_other_packages_stand_in_the_report(
     installed: Any, copied: Store, tmp_path: Path
 ) -> None:
@@ -344,6 +345,7 @@ def test_an_evaluation_of_another_version_is_refused_by_name(copied: Store) -> N
         report(copied, collected(copied))
 
 
+@pytest.mark.long
 def test_an_evaluation_without_figures_by_each_onset_is_shown(copied: Store) -> None:
     older = copied
     path = older.folder / "derived" / "evaluation" / "evaluation.json"
@@ -364,6 +366,7 @@ def test_an_evaluation_without_figures_by_each_onset_is_shown(copied: Store) -> 
     assert "The same decisions by each onset" in page(older)
 
 
+@pytest.mark.long
 def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
     times = [None if k else 900.0 for k in range(8)]
     rows = [
@@ -561,6 +564,7 @@ def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store
         assert f"{name}, the chosen network" in near
 
 
+@pytest.mark.long
 def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
     other = tmp_path / "summary.json"
     shutil.copy(store.folder / "report" / "summary.json", other)

@@ -49,6 +49,7 @@ def browser() -> Iterator[Any]:
         yield found
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", ["index.html", "against.html"])
 @pytest.mark.parametrize("width", [1400, 390, PAPER_PX])
 def test_a_page_fits_and_is_whole(browser: Any, folder: Path, name: str, width: int) -> None:
@@ -85,6 +86,7 @@ INK = """() => [document.body, document.querySelector('#answer svg text')].map(
 """Colours of the ground and of a figure's text."""
 
 
+@pytest.mark.long
 def test_first_screen_answers_in_light_and_dark(browser: Any, folder: Path) -> None:
     grounds, inks = set(), set()
     for scheme in ("light", "dark"):

@@ -396,6 +396,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
     assert (models / "seed0.svg").read_text().count("epoch") >= 2
 
 
+@pytest.mark.long
 def test_the_model_goes_out_as_what_it_is(
     ran: Ran, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

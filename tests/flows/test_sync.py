@@ -108,6 +108,7 @@ def test_a_second_run_does_nothing(store: Store) -> None:
     assert page.exists()
 
 
+@pytest.mark.long
 def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +121,7 @@ def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
     assert sync(store, collected(store))["done"] == 3
 
 
+@pytest.mark.long
 def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None:
     sync(store, collected(store))
     label(store, collected(store))

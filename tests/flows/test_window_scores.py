@@ -78,6 +78,7 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
         assert (onset is None) == (ours == 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("margin", [0.0, 2.0])
 def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) -> None:
     """Another margin once changed the detections, and not the margin accuracy beside them."""
@@ -92,6 +93,7 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
     assert expected != metrics.accuracy(kept["counts"], kept["y"], 30.0).margin
 
 
+@pytest.mark.long
 def test_each_sample_says_its_trial(two: Store) -> None:
     """The last window of no slip ends at the onset of its own trial."""
     campaigns = collected(two)

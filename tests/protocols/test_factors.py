@@ -52,6 +52,7 @@ def varied(source: dict[str, Any], place: int, field: str, unit: str, levels: An
     return data
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize("row", FIELDS.strip().splitlines())
 def test_any_field_of_a_phase_is_a_factor(row: str, tmp_path: Path) -> None:
     """Each level moves the arm as the same number written into the phase does."""

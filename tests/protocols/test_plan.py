@@ -92,6 +92,7 @@ def test_an_added_level_moves_nothing(data: dict[str, Any], name: str, place: in
     assert after.collection_hash == before.collection_hash
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("hash_seed", ["0", "1", "4242"])
 def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
     code = (

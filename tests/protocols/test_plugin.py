@@ -36,24 +36,27 @@ def loaded(*commands: Sequence[str]) -> list[list[str]]:
 
 def test_a_command_loads_no_plug_in_that_it_does_not_use(tmp_path: Path) -> None:
     """One after another in a new process: what one loads stays for the next."""
+    options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
+    *core, helped = loaded(
+        ("plan", "pilot", "--json"), ("collect", "pilot", *options), ("bench", "--help")
+    )
+    assert core == [[], []]
+    assert "sliplab.plugins.bench.study" in helped
+    assert "sliplab.plugins.bench.run" not in helped
+
+
+@pytest.mark.long
+def test_claims_are_loaded_when_they_are_looked_at(tmp_path: Path) -> None:
     claims = tmp_path / "claims.yaml"
     stopping = "  stopping: {claims: [{figure: first_slip, at_most: 10 s}]}\n"
     pilot = (ROOT / "protocols" / "pilot.yaml").read_text()
     claims.write_text(pilot.replace("collection:\n", f"collection:\n{stopping}", 1))
     options = ("--rig", "rehearsal", "--store", str(tmp_path / "store"), "--trials", "1")
-    *core, collected, helped = loaded(
-        ("plan", "pilot", "--json"),
-        ("collect", "pilot", *options),
-        ("plan", str(claims), "--json"),
-        ("collect", str(claims), *options[:3], str(tmp_path / "other"), *options[4:]),
-        ("bench", "--help"),
-    )
-    assert core == [[], [], []]
+    planned, collected = loaded(("plan", str(claims), "--json"), ("collect", str(claims), *options))
+    assert planned == []
     assert "sliplab.plugins.claims.rounds" in collected
     assert not [name for name in collected if name.startswith("sliplab.plugins.claims.power")]
     assert not [name for name in collected if name.startswith("sliplab.plugins.bench.")]
-    assert "sliplab.plugins.bench.study" in helped
-    assert "sliplab.plugins.bench.run" not in helped
 
 
 def test_help_of_all_plug_ins_loads_no_arrays() -> None:

@@ -45,6 +45,7 @@ def test_no_invariant_is_broken_and_a_seed_is_one_story_with_one_trace() -> None
     assert both["hashes"].items() > second["hashes"].items()
 
 
+@pytest.mark.long
 def test_a_planted_defect_is_found() -> None:
     found = storm("--plant=hold_short", "--stories=1", "--no-shrink")
     assert found["failed"] != []

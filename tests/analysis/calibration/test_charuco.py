@@ -51,7 +51,7 @@ def test_the_board_that_is_printed_is_the_one_that_is_simulated() -> None:
     )
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("lens", LENSES)
 def test_the_lens_that_drew_the_pictures_is_found(lens: str) -> None:
     true = camera(lens)
@@ -75,6 +75,7 @@ def test_the_lens_that_drew_the_pictures_is_found(lens: str) -> None:
     assert fit.distortion[4] == 0.0
 
 
+@pytest.mark.long
 def test_coefficients_have_to_earn_their_place() -> None:
     assert fit_lens(views("straight"), BOARD, SIZE).model == "k1"
     assert fit_lens(views("tangential"), BOARD, SIZE).model == "k1 k2 p1 p2"

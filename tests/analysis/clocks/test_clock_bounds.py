@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from sliplab.analysis.clocks.clock_bounds import BoundsContradictError, fit_bounds
 
 
+@pytest.mark.long
 @given(
     seed=st.integers(0, 2**32 - 1),
     ppm=st.floats(-190, 190),

@@ -93,6 +93,7 @@ def test_a_bent_clock_gets_a_bent_line_or_is_refused(
         assert far <= 3 * stated
 
 
+@pytest.mark.long
 def test_straight_clocks_are_fitted_as_exactly_as_by_a_straight_line() -> None:
     rng = np.random.default_rng(44)
     errors = []
@@ -121,6 +122,7 @@ def test_the_stated_uncertainty_holds_for_bends_near_the_threshold(
     assert max(far / stated for far, stated, _ in found) <= 3
 
 
+@pytest.mark.long
 def test_a_straight_line_agrees_with_a_reference_of_higher_precision() -> None:
     """Huber's estimate by iteration to the last digit, in numbers of 64 bits of mantissa."""
     rng = np.random.default_rng(9)
@@ -200,6 +202,7 @@ def test_a_straight_clock_is_known_where_a_stretch_of_pulses_was_lost(
         assert line.uncertainty < 3 * JITTER_NS
 
 
+@pytest.mark.long
 def test_pulses_left_out_at_an_end_turn_a_straight_line_only_beyond_chance() -> None:
     """They were left out since they lie off the line: of 1,500 trains, one in 300 did turn."""
     rng = np.random.default_rng(7)

@@ -16,6 +16,7 @@ GOOD = tuple(kind for kind in KINDS if kind not in (*HOPELESS, *JUMPS))
 REFUSED = dict.fromkeys(("lost_30_on_both",), 0.1)
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("kind", [*JUMPS, *HOPELESS])
 def test_nothing_wrong_is_accepted(kind: str) -> None:
     found = tally(kind, 40)
@@ -24,6 +25,7 @@ def test_nothing_wrong_is_accepted(kind: str) -> None:
         assert found.refused > 0.9
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("kind", GOOD)
 def test_good_trains_are_accepted_and_their_uncertainty_holds(kind: str) -> None:
     found = tally(kind, 60)

@@ -36,6 +36,7 @@ def issued(rng: np.random.Generator) -> tuple[Ints, Ints, Ints]:
     return made.device, made.reference, made.true_device
 
 
+@pytest.mark.long
 def test_bad_trains_are_fitted_and_their_uncertainty_is_honest() -> None:
     rng = np.random.default_rng(2026)
     worst, held, count = 0.0, 0, 300
@@ -152,6 +153,7 @@ def test_a_drift_of_one_percent(ppm: float) -> None:
     assert worst_error(fit, made) < 3_000
 
 
+@pytest.mark.long
 def test_a_trial_of_an_hour() -> None:
     """Five rounds of a 16-bit code: right where both saw all of it, refused where the first went.
 

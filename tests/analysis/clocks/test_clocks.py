@@ -81,6 +81,7 @@ def test_a_faulty_train_is_fitted_to_a_few_microseconds(
     assert fit.uncertainty_ns < 5_000
 
 
+@pytest.mark.long
 def test_the_stated_uncertainty_holds() -> None:
     rng = np.random.default_rng(7)
     held, count = 0, 400

@@ -76,7 +76,7 @@ def worlds_with_alarms(
     return found
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("draws", [20, 400])
 @pytest.mark.parametrize("shape", [1.0, 100.0])
 def test_a_promise_is_kept_in_new_worlds(draws: int, shape: float) -> None:

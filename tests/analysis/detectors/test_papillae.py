@@ -154,6 +154,7 @@ def still(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.zeros((len(t), len(CENTRES)))
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("noise_hz", "within_ms"), [(3000.0, 20), (60000.0, 30)])
 def test_a_marker_that_comes_to_rest_is_seen_at_once(
@@ -182,6 +183,7 @@ def test_a_marker_that_comes_to_rest_while_all_swing_is_no_slip(seed: int) -> No
     assert evidence(drawn(np.random.default_rng(seed), one_stops, on=swinging)).max() < LEVEL
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("seed", range(5))
 def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
     value = evidence(drawn(np.random.default_rng(seed), one_slips_and_sticks, peak=15))
@@ -190,7 +192,7 @@ def test_a_marker_that_jumps_and_sticks_again_is_no_touch(seed: int) -> None:
     assert (value[slip_ms : slip_ms + 40] > LEVEL).any()
 
 
-@pytest.mark.quick(8)
+@pytest.mark.quick(4)
 @pytest.mark.parametrize(
     "rates", [moving, slower, stopping, shaken, brushed, jolted, held_back, still]
 )
@@ -235,6 +237,7 @@ def all_turn(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.where(((t > SLIP_S) & (t < SLIP_S + 0.06))[:, None], 0.5, dark(t))
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(
     ("rates", "on", "within_ms"), [(one_jumps, dark, 30), (shrinking, one_turns, 120)]

@@ -87,6 +87,7 @@ def test_places_rates_hot_cells_and_level_are_those_drawn() -> None:
         assert 0 <= rub.alarm_ms - 1000 * SLIP_S < 20
 
 
+@pytest.mark.long
 def test_a_late_read_finds_the_same() -> None:
     phases = [*QUIET, *[("settle", still), (RUB, one_stops)] * 3]
     prompt, late = measured(phases), measured(phases, read_s=0.4)
@@ -103,12 +104,14 @@ def test_the_level_is_above_all_evidence_without_slip() -> None:
         measured([*unload, *[("settle", still), (RUB, moving)] * 3])
 
 
+@pytest.mark.long
 def test_a_skin_that_does_not_move_is_refused() -> None:
     rubs = [("settle", still), (RUB, one_stops), ("settle", still), (RUB, still)]
     with pytest.raises(SkinError, match="0 places moved at once in rub 2, at least 10 are needed"):
         measured([*QUIET, *rubs, ("settle", still), (RUB, one_stops)])
 
 
+@pytest.mark.long
 def test_a_camera_that_falls_silent_is_refused() -> None:
     with pytest.raises(SkinError, match=r"no events came for 20\.\d s"):
         measured([*QUIET, *[("settle", still), (RUB, one_stops)] * 3], gap_s=20.0)

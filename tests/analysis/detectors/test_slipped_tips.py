@@ -70,6 +70,7 @@ def test_cells_belong_to_the_nearest_tip_and_parts_of_an_edge_are_one() -> None:
         regions(np.full(1200, -1), 40)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("worlds", "most"), [("usual", 0.05), ("hard", 0.12)])
 def test_the_share_is_that_of_the_simulated_tips(worlds: str, most: float) -> None:
     """From the first tip to the last, whatever the chunks are; before the first slip it is 0."""

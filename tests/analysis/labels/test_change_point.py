@@ -65,6 +65,7 @@ def test_a_slip_between_two_frames_is_dated_to_a_millisecond() -> None:
         assert point.low_ns <= point.at_ns <= point.high_ns
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("jerk", [0.0, 0.15])
 def test_its_intervals_hold_the_truth_as_often_as_they_say(jerk: float) -> None:
     rng = np.random.default_rng(2)

@@ -40,6 +40,7 @@ def test_the_reference_loses_what_is_hidden_and_finds_it_again() -> None:
     assert reference_track([], LAYOUT).shape == (0, 19, 2)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("level", [20.0, 60.0])
 def test_glare_is_followed_or_owned_up_to(level: float) -> None:
     """A soft reflection that stands still while the skin moves under it."""

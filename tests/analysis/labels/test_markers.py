@@ -65,6 +65,7 @@ def still(n: int) -> Floats:
     return np.broadcast_to(CENTRE + LAYOUT, (n, *LAYOUT.shape)).copy()
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("px_per_mm", [12.0, 20.0])
 def test_centres_to_a_hundredth_of_a_pixel(px_per_mm: float) -> None:
     rng = np.random.default_rng(1)
@@ -98,6 +99,7 @@ def test_every_marker_on_its_own_way() -> None:
     assert np.abs(tracks.xy - truth).max() < 0.15
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("gap", [6.0, 1.0, 0.0])
 def test_neighbours_may_come_close_enough_to_touch(gap: float) -> None:
     truth = still(40)
@@ -148,6 +150,7 @@ def test_the_camera_covered_for_a_while() -> None:
     assert np.abs((tracks.xy - truth)[~dark]).max() < 0.05
 
 
+@pytest.mark.long
 def test_out_over_the_edge_and_back() -> None:
     away = np.concatenate((np.arange(40), np.arange(40)[::-1])) * 3.7
     truth = still(80) - np.stack((away, np.zeros(80)), axis=-1)[:, None] - np.array([135.0, 0])

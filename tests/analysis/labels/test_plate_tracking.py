@@ -82,6 +82,7 @@ def track_plate(frames: Iterable[Frame], max_bridged: int = MAX_BRIDGED) -> Plat
     return bridge([tracker.update(frame) for frame in frames], max_bridged)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("angle", [0.0, 0.1, 2.0])
 def test_corners_and_centre_to_a_tenth_of_a_pixel(angle: float) -> None:
     rng = np.random.default_rng(1)
@@ -109,6 +110,7 @@ def test_a_jump_across_the_frame_is_found() -> None:
     assert np.abs(track_.xy - centres).max() < 0.2
 
 
+@pytest.mark.long
 def test_short_gaps_are_bridged_and_flagged() -> None:
     centres = np.array([150.0, 100.0]) + np.arange(30)[:, None] * np.array([2.0, 1.0])
     frames = [stick(dark(), at) for at in centres]

@@ -49,6 +49,7 @@ def as_said(found: float) -> bool:
     return 0.93 - NOISE <= found <= 0.97 + NOISE
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize("kind", ["normal", "skewed"])
 def test_a_mean_is_held_as_often_as_said(kind: str, n: int) -> None:
@@ -58,6 +59,7 @@ def test_a_mean_is_held_as_often_as_said(kind: str, n: int) -> None:
     assert as_said(coverage(measure, 80.0, n))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize(("a", "b"), [(18, 2), (9, 1)])
 def test_a_share_of_windows_is_held_as_often_as_said(a: int, b: int, n: int) -> None:
@@ -70,6 +72,7 @@ def test_a_share_of_windows_is_held_as_often_as_said(a: int, b: int, n: int) -> 
     assert as_said(coverage(measure, a / (a + b), n))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("statistic", "n"), [("median", 6), ("median", 12), ("median", 132), ("p95", 72), ("p95", 132)]
 )
@@ -79,6 +82,7 @@ def test_a_quantile_is_held_as_often_as_said(statistic: str, n: int) -> None:
     assert as_said(found)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("n", SOME)
 @pytest.mark.parametrize("paired", [False, True])
 def test_a_difference_of_means_is_held_as_often_as_said(paired: bool, n: int) -> None:
@@ -106,6 +110,7 @@ def test_a_difference_of_shares_is_held_as_often_as_said(n: int) -> None:
     assert as_said(coverage(measure, 0.09, n))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("paired", [False, True])
 def test_a_difference_of_medians_is_held_at_least_as_often_as_said(paired: bool) -> None:
     def measure(rng: np.random.Generator) -> Any:

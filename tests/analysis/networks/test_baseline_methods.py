@@ -46,6 +46,7 @@ def trained_net(
     return baseline_nets.net_votes(net, test, 3), said
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", sorted(KINDS | TAXEL_KINDS))
 def test_each_network_finds_what_it_can_see(kind: str) -> None:
     epochs = 40  # of two steps each, of which the last few are small

@@ -87,6 +87,7 @@ def test_thresholds_are_the_best_there_are(rows: list[tuple[int, int]]) -> None:
     assert table.any(axis=1).all()
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=20)
 @given(cases)
 def test_the_order_of_the_classes_changes_nothing(rows: list[tuple[int, int]]) -> None:

@@ -112,6 +112,7 @@ def check_counts(found: Any, x: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_array_equal(SpikeEngine(found.fast(), CELLS).counts(x), expected)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("batch", [1, 7, 64])
 def test_weights_of_tenths_give_sinabs_own_counts(tmp_path: Path, batch: int) -> None:
     net, x = papers(0.1), windows(150, 0.2)

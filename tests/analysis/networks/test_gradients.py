@@ -100,6 +100,7 @@ def test_the_same_batch_gives_the_same_bits(way: Way) -> None:
         assert torch.equal(gradient, again.gradients[name])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("way", [WAYS[0], pytest.param(WAYS[1], marks=pytest.mark.long), *WAYS[2:]])
 def test_a_training_on_a_device_goes_the_same_way(
     way: Way, monkeypatch: pytest.MonkeyPatch

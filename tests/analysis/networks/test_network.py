@@ -178,6 +178,7 @@ def test_weights_that_do_not_fit_are_named() -> None:
         network.set_weights(net, good | {"fc2.weight": good["fc2.weight"].T})
 
 
+@pytest.mark.long
 def test_the_chip_vendors_package_is_never_imported() -> None:
     """It would try to install things when it is imported."""
     code = (

@@ -65,6 +65,7 @@ def sparse(n: int, windows: Windows, seed: int, share: float) -> np.ndarray:
     return rng.poisson(share, shape).astype(np.uint8)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("share", [0.004, 0.03, 0.5, 80.0])
 def test_spike_counts_are_sinabs_own(share: float) -> None:
     for seed in range(3):
@@ -123,6 +124,7 @@ def test_how_often_each_layer_fires() -> None:
 grid_weights = st.integers(-3, 3)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(data=st.data())
 def test_extremes(data: st.DataObject) -> None:

@@ -112,7 +112,7 @@ def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
     return [float(np.linalg.norm(f - e.numpy()) / np.linalg.norm(e)) for f, e in pairs]
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("windows", "share"), [(TINY, 0.1), (TINY, 0.3), (FULL, 0.01), (FULL, 0.03)]
 )

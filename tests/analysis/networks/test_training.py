@@ -101,6 +101,7 @@ def test_a_network_without_biases_learns_and_has_none(tmp_path: Path) -> None:
     assert load(tmp_path / "a.pt").network == network
 
 
+@pytest.mark.long
 def test_every_seed_learns() -> None:
     settings = TRAINING.model_copy(update={"epochs": 10, "patience": 10})
     train = windows_like(600, 3)
@@ -128,6 +129,7 @@ def test_the_same_seed_gives_the_same_bits_and_the_same_file(
     assert not torch.equal(other.state_dict["fc2.weight"], fitted.state_dict["fc2.weight"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("threads", [2, 5])
 def test_the_number_of_threads_changes_no_bit(fitted: Fitted, threads: int) -> None:
     torch.set_num_threads(threads)
@@ -182,6 +184,7 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
         assert differs.float().mean() < 0.01
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("stop", [1, 3])
 @pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_a_training_goes_on_to_the_same_bits(stop: int, schedule: str) -> None:

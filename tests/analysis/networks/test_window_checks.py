@@ -43,6 +43,7 @@ def chance(**changes: object) -> window_checks.Chance:
     )  # type: ignore[arg-type]  # whatever the test changes
 
 
+@pytest.mark.long
 def test_shuffled_labels_are_at_chance_and_true_ones_are_not() -> None:
     found = chance()
     check_chance(found)
@@ -52,6 +53,7 @@ def test_shuffled_labels_are_at_chance_and_true_ones_are_not() -> None:
     assert chance() == found
 
 
+@pytest.mark.long
 def test_labels_that_were_not_really_shuffled_are_found_out() -> None:
     with pytest.raises(CheckFailed, match="something other than the training labels"):
         check_chance(chance(deal=lambda labels, seed: labels))

@@ -95,6 +95,7 @@ def render(*sections: Content, simulated: bool = False, notices: Sequence[str] =
     return cover.render(campaigns, sections, simulated=simulated)
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("name", sorted(DRAWN))
 def test_figures_are_whole_and_say_what_they_are(name: str) -> None:
     draw, words = DRAWN[name]

@@ -118,7 +118,7 @@ def of(scores: ExperimentScores, name: str) -> float:
     return np.nan if found is None else float(found)
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("case", ["moves", "drops out", "comes in", "comes and moves"])
 def test_changes_are_those_of_an_evaluation_made_again(made: Evaluated, case: str) -> None:
     place = 7

@@ -24,6 +24,8 @@ from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.conftest import tiny, tiny_gravity, write
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -81,6 +81,7 @@ def error_of(frame: PlateFrame) -> tuple[float, float]:
     return float(np.abs(far).max()), float(turned)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("moved_mm", "leant_mm"),
     [
@@ -141,6 +142,7 @@ def test_depth_zero_by_both_ways_is_the_truth(tmp_path: Path) -> None:
     assert set(entry_) >= {"zero", "by_events", "by_markers", "difference", "residual", "taught"}
 
 
+@pytest.mark.long
 def test_a_touch_depth_that_is_wrong_is_told_by_the_markers(tmp_path: Path) -> None:
     path = lab(tmp_path)
     path.write_text(path.read_text().replace("touch_depth: 0.34 mm", "touch_depth: 0.04 mm"))
@@ -190,6 +192,7 @@ def test_the_crop_is_where_the_skin_is(tmp_path: Path) -> None:
         calibrate.calibrate_crop(session(lab(tmp_path)), 0.01, 0.1)
 
 
+@pytest.mark.long
 def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(MOCK + "  frame_camera: {k1: -0.2}\n")
@@ -228,6 +231,7 @@ def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:
         calibrate.see_boards(session(lab(tmp_path)), 4)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", ["board.png", "board.pdf"])
 def test_the_printed_board_has_its_true_size(tmp_path: Path, name: str) -> None:
     sizes = print_board(Board(), tmp_path / name)

@@ -57,6 +57,7 @@ def test_the_document_has_a_schema(document: Path) -> None:
     assert check_refusals("detector", document, every=False) > 25
 
 
+@pytest.mark.long
 def test_it_says_what_so_much_holding_supports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,6 +135,7 @@ def test_a_stop_leaves_the_arm_at_rest_and_clear(
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_a_skin_that_was_not_seen_writes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

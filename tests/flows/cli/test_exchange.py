@@ -175,6 +175,7 @@ def _mutated(head: bytes, rng: random.Random) -> bytes:
     return bytes(made)
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("count", [5, pytest.param(100, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", FILES)
 def test_mutated_headers_give_one_message_and_leave_nothing(

@@ -100,6 +100,7 @@ def test_the_core_plans_reads_and_writes(store: Path, tmp_path: Path) -> None:
         assert code == 0, f"{command}: {said}"
 
 
+@pytest.mark.long
 def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
     done = run(BLOCKED + PYTHON, tuple(EXTRAS), store)
     assert done.returncode == 0, done.stderr
@@ -150,7 +151,7 @@ TOGETHER = ["prefect", "report hardware", "parquet", "learn publish", "video clu
 """Extras that a process lacks: all at once where no command needs two of them."""
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("extras", TOGETHER)
 def test_a_command_says_which_extra_it_lacks(extras: str, store: Path, tmp_path: Path) -> None:
     lacked = extras.split()

@@ -60,6 +60,7 @@ def only(folder: Path) -> Recording:
     return campaign.recording(*campaign.committed())
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("camera", ["events", "frames"])
 def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) -> None:
     found = only(taken[camera])
@@ -83,6 +84,7 @@ def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) ->
         train(store, collected(store))
 
 
+@pytest.mark.long
 def test_the_camera_that_is_there_sees_what_it_saw_beside_the_other(
     taken: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ LONG = ((2.4, 6.0), (1.8, 1.6))
 SLIDES = [(2.4, 20.0), *(pytest.param(*each, marks=pytest.mark.long) for each in LONG)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("depth_mm", "speed_mm_s"), SLIDES, ids=str)
 def test_onsets_are_within_two_frames_of_the_truth(
     tmp_path: Path, depth_mm: float, speed_mm_s: float

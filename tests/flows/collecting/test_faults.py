@@ -177,6 +177,7 @@ SEEN: list[tuple[dict[str, Any], str]] = [
 ]
 
 
+@pytest.mark.quick(6)
 @pytest.mark.parametrize(
     ("fault", "gate"), SEEN, ids=[case[0]["kind"] + "-" + case[1] for case in SEEN]
 )
@@ -206,6 +207,7 @@ def test_the_deviation_that_a_gate_measures_is_the_arms(tmp_path: Path) -> None:
     assert values["good"] < 0.015  # noise of the poses
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("part", [1.0, 0.4])
 def test_an_arm_slower_than_it_was_told_is_taken_again(tmp_path: Path, part: float) -> None:
     """At half its speed, all the way or in its last part, and "done" for all that it says."""
@@ -242,6 +244,7 @@ def _only(campaign: Campaign) -> str:
     return str(failed["folder"])
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(
     "fault",
     [

@@ -145,6 +145,7 @@ def test_a_gate_of_force_needs_a_sensor(tmp_path: Path) -> None:
         session(tmp_path / "a", gated(normal_force="5 N"), frame_camera=TRACKS)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("per_m", [0.0, -30.0])
 def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path: Path) -> None:
     data = short()
@@ -310,6 +311,7 @@ def to_force(**press: Any) -> dict[str, Any]:
     return data
 
 
+@pytest.mark.long
 def test_a_plan_presses_to_a_force_in_place_of_a_depth(tmp_path: Path) -> None:
     work, campaign = felt(tmp_path, to_force(), {"noise_n": 0.002})
     take_all(work)

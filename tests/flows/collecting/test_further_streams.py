@@ -310,6 +310,7 @@ def record_calls(rig: Rig, called: list[str]) -> None:
         setattr(getattr(devices[name], "_target", devices[name]), what, noted)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", ["side", "back", "wrist", "warm"])
 def test_a_device_lost_in_a_trial_stops_the_arm_first(name: str, tmp_path: Path) -> None:
     streams = {"side": SIDE, "back": BACK, "wrist": WRIST, "warm": WARM}
@@ -442,6 +443,7 @@ def test_the_shipped_rig_passes_its_check(tmp_path: Path) -> None:
     assert {f"clock: {name}" for name in file.streams} <= names
 
 
+@pytest.mark.long
 def test_sync_shows_the_clock_of_each(taken: Recording) -> None:
     store = taken.folder.parents[3]
     devices = answer("sync", store)["campaigns"]["tiny"]["devices"]

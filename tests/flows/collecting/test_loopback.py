@@ -127,6 +127,7 @@ def with_arm(file: RigFile, kind: str) -> RigFile:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [pytest.param("abb", marks=pytest.mark.long), "abb_socket"])
 def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> None:
     run_request = request_in(tmp_path / "live", quick(), rig_yaml(tmp_path))

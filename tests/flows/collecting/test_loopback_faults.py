@@ -151,6 +151,7 @@ FIRST = {("arm", "arm_protective_stop"), ("sync_box", "device_gone")}
 """Tried every time; a further event camera is unplugged in test_loopback_streams.py."""
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "case",
     [
@@ -229,6 +230,7 @@ def put_right(stage: Loopback, device: str) -> None:
     assert stage.arm_place()[2] < 0
 
 
+@pytest.mark.long
 def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
     scene: tuple[Loopback, RunRequest],
 ) -> None:
@@ -246,6 +248,7 @@ def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
     assert verify(Store.open(run_request.store)) == []
 
 
+@pytest.mark.long
 def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, RunRequest]) -> None:
     stage, run_request = scene
     assert run_request.rig.devices is not None

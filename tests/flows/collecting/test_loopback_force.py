@@ -64,6 +64,7 @@ def run_request(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
     return request_in(folder / "live", wide(), force_yaml(folder))
 
 
+@pytest.mark.long
 def test_forces_come_through_the_wire_as_the_mock_has_them(
     run_request: RunRequest, tmp_path: Path
 ) -> None:
@@ -134,6 +135,7 @@ def by_the_arm(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
     return request_in(folder / "live", wide(), force_yaml(folder, "ur_wrench"))
 
 
+@pytest.mark.long
 def test_a_trial_has_the_arms_own_wrench_by_its_clock(
     by_the_arm: RunRequest, tmp_path: Path
 ) -> None:

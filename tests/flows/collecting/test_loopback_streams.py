@@ -66,6 +66,7 @@ def test_two_event_cameras_are_recorded_on_one_time_line(tmp_path: Path) -> None
         assert np.corrcoef(rates)[0, 1] > 0.7
 
 
+@pytest.mark.long
 def test_a_second_camera_that_is_unplugged_stops_the_arm(tmp_path: Path) -> None:
     run_request = request_in(tmp_path / "live", quick(), two_event_cameras(tmp_path))
     with (

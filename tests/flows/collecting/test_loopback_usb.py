@@ -50,6 +50,7 @@ def usb_rig(folder: Path) -> Path:
     return write(folder / "rig.yaml", data)
 
 
+@pytest.mark.long
 def test_frames_of_a_usb_camera_show_the_slide(tmp_path: Path) -> None:
     run_request = request_in(tmp_path / "live", quick(), usb_rig(tmp_path))
     with (

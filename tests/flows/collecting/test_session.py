@@ -66,6 +66,7 @@ def checksums(campaign: Campaign) -> dict[str, str]:
     return {recording.trial_id: recording.checksum for recording in campaign.recordings()}
 
 
+@pytest.mark.long
 def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
     video, data = {"level": "video"}, short()
     data["collection"]["recording"]["region"] = {"width": "12 mm", "height": "12 mm"}

@@ -62,7 +62,7 @@ def interrupted(wanted: RunRequest) -> Campaign:
     return Store.open(wanted.store).campaign(NAME)
 
 
-@pytest.mark.quick(5)
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("times", TIMES)
 @pytest.mark.parametrize(
     ("owner", "name", "at"),

@@ -21,6 +21,7 @@ from tests.flows.conftest import tiny, write
 RIG = ROOT / "rigs" / "tactip.yaml"
 
 
+@pytest.mark.long
 def test_a_trial_of_127_pins_passes_its_gates_and_is_labelled(tmp_path: Path) -> None:
     data = tiny()
     data["collection"]["factors"]["direction"]["values"] = [0]

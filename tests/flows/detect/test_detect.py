@@ -212,6 +212,7 @@ def test_a_false_alarm_in_the_hold_moves_nothing(model: Path, protocol: Path) ->
     assert result["reflex"]["phase"] == "slide"
 
 
+@pytest.mark.long
 def test_a_reflex_in_a_retraction_keeps_the_plate(model: Path, tmp_path: Path) -> None:
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}

@@ -54,6 +54,7 @@ def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
     print(f"simulated: latency {result['latency_ms']}, compute {result['compute_ms']}, {reflex}")
 
 
+@pytest.mark.long
 def test_a_grip_through_real_drivers_tightens_the_fingers_of_the_scene(tmp_path: Path) -> None:
     file = write(
         tmp_path / "gripper.yaml",

@@ -58,6 +58,7 @@ class Failing(Detector):
         return Evidence.of([until_us], [np.nan])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", ["rate", "flow"])
 def test_the_bench_says_live_what_it_says_of_the_events(
     name: str, protocol: Path, tmp_path: Path
@@ -107,6 +108,7 @@ def test_the_arm_stops_where_it_fails(protocol: Path) -> None:
         assert stands_clear(rigs[-1])
 
 
+@pytest.mark.long
 def test_in_its_process_it_is_the_same_and_a_hang_ends_in_time() -> None:
     rng = np.random.default_rng(1)
     t_us = np.sort(rng.integers(0, 300_000, 3000))

@@ -249,6 +249,7 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
     assert (rigs[0].position().depth_mm < 0) != stays
 
 
+@pytest.mark.long
 def test_the_command_says_what_was_lost_and_fails(
     model: Path, protocol: Path, tmp_path: Path
 ) -> None:
@@ -338,6 +339,7 @@ def test_limits_of_force_hold_for_grips(gripping: Gripping) -> None:
 # -- the network's process -------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_network_in_its_process_is_the_network_and_a_hang_ends_in_time(model: Path) -> None:
     from sliplab.analysis.detectors.network_detector import counting_of
 

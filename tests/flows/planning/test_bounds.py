@@ -84,6 +84,7 @@ PROTOCOLS = {
 }
 
 
+@pytest.mark.quick(8)
 @pytest.mark.parametrize("value", [True, float("inf"), float("-inf"), float("nan"), 1e300, "inf"])
 @pytest.mark.parametrize(
     ("model", "name"),

@@ -214,6 +214,7 @@ def test_what_cannot_be_used_is_said_at_once(
     assert not (taken / "derived" / "labels").exists()
 
 
+@pytest.mark.long
 def test_the_commands_of_the_docs_listen_on_this_computer_only() -> None:
     places = ("docs/scale.md", "docs/howto/analyse-on-a-cluster.md")
     pages = [(ROOT / place).read_text() for place in places]

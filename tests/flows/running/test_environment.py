@@ -29,6 +29,7 @@ BYTES = os.fsdecode(b"Gr\xf6\xdfe")
 """A Latin-1 name."""
 
 
+@pytest.mark.long
 def test_server_keeps_its_database_in_an_oddly_named_home(tmp_path: Path) -> None:
     name = f"{BYTES} {ODD}"
     with closing(sqlite3.connect(tmp_path / "lab.db")) as other, other:
@@ -188,6 +189,7 @@ def test_text_that_is_not_utf_8_is_one_line_where_it_cannot_be_kept(tmp_path: Pa
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.quick(1)
 @pytest.mark.programs
 @pytest.mark.parametrize(
     ("change", "code", "said"),
@@ -231,6 +233,7 @@ print(len(list(store)))
 """
 
 
+@pytest.mark.long
 @pytest.mark.programs
 def test_label_in_a_script_without_a_guard_collects_once(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)

@@ -88,6 +88,7 @@ def test_every_step_goes_on_after_it_was_killed(
             assert (end["state"], end["by"]) == ("CRASHED", "next start")
 
 
+@pytest.mark.long
 def test_a_worker_process_that_is_killed_is_said_and_the_rest_is_made(
     taken: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return ended(["bash", "-c", line], stdin=subprocess.DEVNULL)
 
 
-@pytest.mark.quick(5)
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [

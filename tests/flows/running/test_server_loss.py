@@ -187,6 +187,7 @@ def test_a_named_server_that_stands_still_is_reported_to_again(tmp_path: Path) -
         assert all(state == "COMPLETED" for _, state in states(tmp_path / "home" / "prefect.db"))
 
 
+@pytest.mark.long
 def test_a_named_server_that_is_not_there_is_said(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -199,6 +200,7 @@ def test_a_named_server_that_is_not_there_is_said(tmp_path: Path) -> None:
         assert "refused" in line
 
 
+@pytest.mark.long
 def test_a_server_that_cannot_start_is_said_with_its_cause(tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.mkdir()

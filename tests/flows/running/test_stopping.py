@@ -171,7 +171,7 @@ main()
 """
 
 
-@pytest.mark.quick(5)
+@pytest.mark.quick(2)
 @pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize("number", stopping.SIGNALS)
 @pytest.mark.parametrize(

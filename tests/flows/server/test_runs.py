@@ -117,6 +117,7 @@ def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:
     ]
 
 
+@pytest.mark.long
 def test_a_push_that_hangs_delays_no_collection(page: Page) -> None:
     data = tiny()
     data["name"] = "beside"

@@ -160,6 +160,7 @@ def test_pause_is_shown_on_the_page_only_while_the_run_is_running(server: Embedd
     assert ended.is_completed()
 
 
+@pytest.mark.long
 def test_claims_end_a_collection_of_the_service_too(service: Service, tmp_path: Path) -> None:
     from sliplab.flows.server.deployments import collect
 

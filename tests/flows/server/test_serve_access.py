@@ -189,6 +189,7 @@ def test_a_run_is_answered_nothing_of_files_elsewhere(served: Service) -> None:
     assert "protocol = /proc/self/environ: must be a file .yaml or .yml below " in ended["message"]
 
 
+@pytest.mark.long
 def test_a_permanent_server_needs_a_password_too(served: Service, tmp_path: Path) -> None:
     page_server.refuse_open(served.page.url)
     with socket.socket() as probe:

@@ -88,6 +88,7 @@ def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             running.stop()
 
 
+@pytest.mark.long
 @pytest.mark.realtime
 def test_a_campaign_is_paused_and_cancelled_and_goes_on(
     server: tuple[str, str], password: str, tmp_path: Path

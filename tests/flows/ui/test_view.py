@@ -154,6 +154,7 @@ def test_onsets_of_label_review_and_truth_are_told_apart(saved: tuple[Read, Any]
     assert counts["windows"] == 4
 
 
+@pytest.mark.long
 def test_too_many_events_become_pictures_that_count_them(
     made: Reviewable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -225,6 +225,7 @@ def test_reader_reviews_nothing(made: Reviewable) -> None:
     assert review.history(made.store, NAME, trial) == []
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(
     ("changes", "status", "text"),
     [

@@ -69,6 +69,7 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> None:
     assert time.monotonic() - began < within_s + BUSY_S
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("speed", [1.6, pytest.param(6.0, id="6.0, ten times as fast as 0.6")])
 def test_a_slide_in_pieces_is_at_its_speed_where_they_run_into_each_other(
     pair: MakePair, speed: float
@@ -126,6 +127,7 @@ def test_a_stop_waits_for_one_piece_and_no_more(pair: MakePair) -> None:
     assert arm.state() is ArmState.READY
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE, Kind.PROTECTIVE_STOP])
 def test_a_move_that_is_not_answered_is_a_fault(
     pair: MakePair, monkeypatch: pytest.MonkeyPatch, kind: Kind
@@ -142,6 +144,7 @@ def test_a_move_that_is_not_answered_is_a_fault(
     assert arm.state() is ArmState.READY
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_connecting_or_idle(pair: MakePair, kind: Kind) -> None:
     arm, robot = pair(connected=False, faults=[Fault(kind, Stage.CONNECTING)])
@@ -178,6 +181,7 @@ def test_a_lost_link_in_mid_motion_ends_with_its_piece(pair: MakePair) -> None:
     assert arm.state() is ArmState.READY
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.PROTECTIVE_STOP])
 def test_a_stop_that_nobody_can_confirm_is_a_fault(
     pair: MakePair, monkeypatch: pytest.MonkeyPatch, kind: Kind

@@ -156,6 +156,7 @@ def test_table_has_every_kind() -> None:
     assert {row.kind for row in TABLE if row.urgent} == set(settings().urgent)
 
 
+@pytest.mark.quick(4)
 @ROWS
 def test_received_within_ten_seconds_and_once(
     row: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -175,6 +176,7 @@ def test_received_within_ten_seconds_and_once(
     assert row.text in mails[0]
 
 
+@pytest.mark.quick(2)
 @ROWS
 def test_not_lost_while_receivers_are_down_for_five_minutes(
     row: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -194,6 +196,7 @@ def test_not_lost_while_receivers_are_down_for_five_minutes(
     assert row.text in mails[0]
 
 
+@pytest.mark.quick(2)
 @ROWS
 def test_quiet_hours_hold_what_is_not_urgent(
     row: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -36,6 +36,7 @@ def _regular() -> tuple[F64, F64]:
     return a[5:] + rng.normal(0, 20e-6, 95), b[:90]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_intervals_hold_and_jumps_are_placed(kind: str) -> None:
     rng = np.random.default_rng(RNG)
@@ -237,6 +238,7 @@ FILES: dict[str, tuple[str | bytes, str]] = {
 }
 
 
+@pytest.mark.quick(10)
 @pytest.mark.parametrize("name", FILES)
 def test_files_of_strangers_are_read_or_their_fault_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -138,6 +138,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -57,6 +57,7 @@ def test_without_its_slip_a_tip_is_dragged_on() -> None:
     np.testing.assert_array_equal(found[:, 5], rows[:, 5])
 
 
+@pytest.mark.long
 def test_of_a_slide_it_is_milliseconds_and_repeats() -> None:
     drawn = scenes_of(SIZES["small"], 5, "usual")[:3]
     waits = [waits_ms(slide, [1.0, 100.0]) for slide in drawn]

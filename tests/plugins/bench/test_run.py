@@ -74,6 +74,7 @@ def test_worlds_that_do_not_exist_are_refused(tmp_path: Path) -> None:
         run.run_bench(["rate"], "small", 1, tmp_path, worlds="harder")
 
 
+@pytest.mark.long
 def test_other_test_worlds_change_figures_and_no_choice(folder: Path) -> None:
     one, other = (run.run_bench(NAMES, "small", seed, folder) for seed in (1, 2))
     assert choices(one) == choices(other)
@@ -85,6 +86,7 @@ def test_other_test_worlds_change_figures_and_no_choice(folder: Path) -> None:
     assert one.hours["test"] != other.hours["test"]
 
 
+@pytest.mark.long
 def test_choices_are_made_before_a_test_scene_is_there(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -108,6 +110,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
     assert set(done[done.index("chosen") + 1 :]) == {"test", *FEW}
 
 
+@pytest.mark.long
 def test_a_detector_is_trained_on_training_and_validation_scenes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -160,6 +163,7 @@ def test_processes_give_the_figures_of_one(folder: Path, tmp_path: Path) -> None
 
 
 def test_the_command_prints_what_it_writes(folder: Path) -> None:
+    run.run_bench(NAMES, "small", 1, folder)  # in this process, where scenes are few
     words = ("bench", *NAMES, "--small", "--seed", 1, "--folder", folder)
     done = here(*words, "--json")
     assert done.returncode == 0, done.stderr
@@ -186,6 +190,7 @@ def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Pa
     page.write_text(
         "# Bench\n\n<!-- bench: written by `sliplab bench` -->\nold\n<!-- bench: end -->\n\nafter\n"
     )
+    run.run_bench(NAMES, "small", 1, folder)
     for _ in range(2):
         words = ("bench", *NAMES, "--small", "--seed", 1, "--folder", folder, "--leaderboard", page)
         assert here(*words).returncode == 0
@@ -227,6 +232,7 @@ def test_a_detector_that_breaks_the_rules_is_named(tmp_path: Path) -> None:
         run.run_bench([name], "small", 1, tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("apart")
 def test_a_detector_has_nothing_but_what_it_was_given(tmp_path: Path) -> None:
     name = "tests.plugins.bench.made:Snoops"
@@ -235,6 +241,7 @@ def test_a_detector_has_nothing_but_what_it_was_given(tmp_path: Path) -> None:
     assert row.decision_us > 0
 
 
+@pytest.mark.long
 def test_a_seed_is_drawn_once_for_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     drawn = iter((1, 2))  # whose scenes have been simulated

@@ -113,6 +113,7 @@ def test_events_rise_when_the_arm_moves_and_not_before(slides: list[Scene]) -> N
         assert after > 1.5 * before
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", NUISANCES)
 def test_a_nuisance_changes_the_events_and_hardly_the_slip(name: str) -> None:
     (drawn,) = scenes.nuisance_scenes(SIZE, 1)[name]

@@ -111,6 +111,7 @@ def test_evidence_does_not_depend_on_chunks(network: TipNetwork) -> None:
     assert np.array_equal(whole.value, parts.value)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_seed_gives_the_same_network(seed: int) -> None:
     scenes, one = [slide(k) for k in range(3)], slide(40)

@@ -60,6 +60,7 @@ TRIVIAL = {
 }
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_they_are_below_a_detector_that_sees_the_slip(seed: int) -> None:
     train, validation, test = (some_scenes(10 * seed + k) for k in range(3))

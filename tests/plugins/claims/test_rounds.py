@@ -84,6 +84,7 @@ def record_of(run_request: RunRequest) -> StoppingRecord:
     return StoppingRecord.load(campaign_of(run_request).folder / STOPPING)
 
 
+@pytest.mark.long
 def test_a_campaign_ends_when_its_claims_hold_and_stays_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +118,7 @@ def test_least_and_most_bound_the_trials(tmp_path: Path) -> None:
     assert record_of(early).verdict == "most"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_a_thread")
 def test_cut_anywhere_an_adaptive_campaign_goes_on_with_the_same_trial(tmp_path: Path) -> None:
     options = {"order": "adaptive", "choice": {"batch": 4, "start": 3}}
@@ -176,6 +178,7 @@ def test_a_trial_that_is_taken_again_is_looked_at_again(tmp_path: Path) -> None:
     assert (record.looks[-1].evidence == before) is False
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("in_a_thread")
 def test_other_claims_are_looked_at_anew(tmp_path: Path) -> None:
     first = request(tmp_path / "a", [SURE])
@@ -187,6 +190,7 @@ def test_other_claims_are_looked_at_anew(tmp_path: Path) -> None:
     assert json.loads(record.model_dump_json())["verdict"] == "most"
 
 
+@pytest.mark.quick(1)
 @pytest.mark.usefixtures("in_a_thread")
 @pytest.mark.parametrize("order", ["shuffled", "adaptive"])
 def test_a_collection_cut_after_its_last_trial_is_looked_at_by_the_next(

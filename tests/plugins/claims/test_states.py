@@ -203,6 +203,7 @@ def test_blocks_of_some_trials_are_stated_by_the_protocol() -> None:
     assert (last.blocks, last.holds) == (9, True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("between_blocks", "campaigns", "most"),
     # 5 % are stated; more than 6 of 40, or 11 of 100, have a chance of 0.4 %
@@ -240,6 +241,7 @@ def test_chosen_trials_give_unbiased_estimates_whatever_is_expected() -> None:
     assert abs(np.mean(found) - y.mean()) < 4 * error
 
 
+@pytest.mark.long
 def test_adaptive_campaigns_are_right_and_take_fewer_trials() -> None:
     chosen = plan_of(WITHIN, order="adaptive", choice={"batch": 12, "start": 24})
     blocks = plan_of(WITHIN)

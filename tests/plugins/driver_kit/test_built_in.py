@@ -123,12 +123,15 @@ DEVICES = {
     "uvc": (uvc_cases, {"times fall back", WRAPS, "lost frames", "level of the sync line"}),
 }
 ONE_AT_A_TIME = {"basler"}  # pylon emulates one camera
-FURTHER = {"ur_wrench"}  # over the connection of the arm, whose rules are tried
+# one arm, camera and stream are enough for a day; the wrench is on the connection of the arm
+FURTHER = ("abb", "abb_socket", "dvxplorer", "lsl", "ur_wrench", "uvc")
+MARKS = dict.fromkeys(FURTHER, pytest.mark.long) | {"ur": pytest.mark.xdist_group("scene")}
+"""That of the arm computes as much as a scene: not beside one."""
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(it, marks=pytest.mark.long if it in FURTHER else ()) for it in DEVICES],
+    [pytest.param(it, marks=MARKS.get(it, ())) for it in DEVICES],
 )
 def test_a_driver_that_ships_keeps_every_rule(name: str) -> None:
     make, not_simulated = DEVICES[name]

@@ -39,6 +39,7 @@ def cases_of(driver: Driver[Any]) -> list[Case]:
     return each_apart(make)
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("driver", EXAMPLES, ids=lambda driver: driver.name)
 def test_an_example_keeps_every_rule(driver: Driver[Any]) -> None:
     broken, not_tried = try_all(cases_of(driver))
@@ -48,7 +49,7 @@ def test_an_example_keeps_every_rule(driver: Driver[Any]) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.quick(5)
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.driver.name)
 def test_a_broken_driver_is_caught_by_the_rules_about_its_defect(broken: Broken) -> None:
     found, _ = try_all(cases_of(broken.driver))
@@ -57,7 +58,7 @@ def test_a_broken_driver_is_caught_by_the_rules_about_its_defect(broken: Broken)
     gc.collect()  # what a broken driver leaves open is closed here, where nobody minds
 
 
-@pytest.mark.quick(31)
+@pytest.mark.quick(15)
 @pytest.mark.parametrize("broken", WRONG_VALUES, ids=lambda broken: broken.driver.name)
 def test_a_driver_with_wrong_values_is_caught_by_the_rules_about_them(broken: Broken) -> None:
     own = [case for case in cases_of(broken.driver) if case.rule.name in broken.rules]

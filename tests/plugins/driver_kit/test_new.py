@@ -138,7 +138,7 @@ def test_a_kind_or_a_folder_that_is_none_is_refused_in_a_line(tmp_path: Path) ->
 
 
 @pytest.mark.programs
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_installed_package_keeps_every_rule_and_its_rig_file_is_valid(
     kind: str, tmp_path: Path

@@ -167,6 +167,7 @@ class MockStreamBench(OnVirtualClock, StreamBench):
         raise NotTried("a simulated loss is a fault of a trial")
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize(
     "rule", [rule for rule in ALL_ARM_RULES if rule.name in ARM_RULES], ids=lambda r: r.name
 )

@@ -289,6 +289,7 @@ def assert_equal(ours: Store, theirs: Store) -> None:
                 np.testing.assert_array_equal(again_arrays[key], values)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("which", ["labelled", "rich"])
 def test_a_published_store_comes_back_as_it_was(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
@@ -382,6 +383,7 @@ def waited_for(trial: RecordedTrial, name: str, rows: int) -> None:
         threading.Event().wait(0.002)
 
 
+@pytest.mark.long
 def test_trials_of_two_campaigns_are_not_mixed(
     labelled: Store, rich: Store, tmp_path: Path
 ) -> None:

@@ -201,6 +201,7 @@ ATTACKS = {
 RUNS_ON = "key of tuples"
 
 
+@pytest.mark.quick(20)
 @pytest.mark.parametrize("name", [it for it in ATTACKS if it != RUNS_ON])
 def test_a_hostile_or_damaged_file_is_refused_at_once(name: str) -> None:
     begun = time.process_time()
@@ -217,12 +218,14 @@ def test_memory_is_limited(name: str) -> None:
         parse_pickle(ATTACKS[name], "x")
 
 
+@pytest.mark.long
 def test_memory_is_limited_for_what_is_small_in_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pickles, "MEMORY", 100 << 20)
     with pytest.raises(InputError, match="more than the memory"):
         parse_pickle(b"(" + b"]" * 2_000_000 + b"l.", "x")
 
 
+@pytest.mark.long
 def test_a_reader_that_runs_on_is_ended() -> None:
     with pytest.raises(InputError, match=r"byte 0: .*more than 3 s or 4 GiB .*ended with code -\d"):
         parse_pickle(ATTACKS[RUNS_ON], "x")

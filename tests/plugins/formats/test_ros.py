@@ -91,6 +91,7 @@ def assert_events(found: Recording, sent: EventChunk) -> None:
 # -- containers ----------------------------------------------------------------------------
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize("writer", WRITERS)
 @pytest.mark.parametrize("of", ["evt3", "list"])
 def test_every_container_gives_events_and_frames(tmp_path: Path, writer: str, of: str) -> None:
@@ -354,6 +355,7 @@ def test_a_bag_without_an_index_says_what_mends_it(tmp_path: Path) -> None:
     assert "`rosbag reindex` writes one" in said
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("writer", ["bag", "bag lz4", "folder"])
 def test_flipped_bits_give_events_or_one_line(tmp_path: Path, writer: str) -> None:
     name, store, write = WRITERS[writer]

@@ -40,6 +40,7 @@ def test_one_campaign_is_published_and_a_missing_licence_is_said(tmp_path: Path)
     assert [path.name for path in (tmp_path / "out" / "campaigns").iterdir()] == ["small"]
 
 
+@pytest.mark.long
 def test_mcap_files_are_published_and_imported_again(tmp_path: Path) -> None:
     store, output = older_store(tmp_path / "store"), tmp_path / "out"
     found = answer("export", store, "--as", "mcap", "--output", output, "--licence", "CC0-1.0")

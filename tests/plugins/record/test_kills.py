@@ -23,7 +23,7 @@ from tests.plugins.record.recordings import (
     sources,
 )
 
-MOMENTS = (8, 200)
+MOMENTS = (4, 200)
 
 
 def kill_at(folder: Path, seconds: float, early: bool) -> int:

@@ -21,6 +21,7 @@ from sliplab.plugins.record.lsl_fake import FakeLsl  # noqa: E402  (needs pylsl)
 pytestmark = pytest.mark.skipif(not available(), reason="needs gcc and pylsl")
 
 
+@pytest.mark.long
 @pytest.mark.realtime
 def test_events_lie_within_the_stated_bound_where_the_clock_drifts_and_jumps(
     tmp_path: Path,

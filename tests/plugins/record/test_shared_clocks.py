@@ -22,6 +22,7 @@ TOGETHER_NS = 50_000
 RECORDINGS = (6, 200)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.realtime
 @pytest.mark.parametrize("clock", ["ptp", "utc"])
 @pytest.mark.parametrize(

@@ -47,6 +47,7 @@ def said(state: int) -> np.ndarray:
     return counts
 
 
+@pytest.mark.long
 def test_who_cries_always_or_never_is_at_the_bottom(
     model: Path, fast: Path, tmp_path: Path
 ) -> None:
@@ -71,6 +72,7 @@ def test_who_cries_always_or_never_is_at_the_bottom(
         assert (never.dropped, never.missed, never.prevented) == (1, 1, 0)
 
 
+@pytest.mark.long
 def test_what_was_done_is_kept_and_not_done_again(
     model: Path, fast: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,6 +103,7 @@ def test_what_was_done_is_kept_and_not_done_again(
     assert (tmp_path / "reflex.html").is_file()
 
 
+@pytest.mark.long
 def test_a_store_has_all_its_detectors(
     ran: tuple[list[RunRequest], StudyOutcome], fast: Path, tmp_path: Path
 ) -> None:
@@ -125,6 +128,7 @@ def test_a_store_has_all_its_detectors(
     assert len(keys) == len(asked.cases)
 
 
+@pytest.mark.long
 def test_a_store_detects_by_any_of_its_detectors(
     ran: tuple[list[RunRequest], StudyOutcome], fast: Path
 ) -> None:
@@ -149,6 +153,7 @@ def test_a_store_detects_by_any_of_its_detectors(
         assert right in json.loads(done.stdout)["error"]["message"]
 
 
+@pytest.mark.long
 def test_a_detector_of_the_bench_is_set_by_the_store_and_reacts(
     ran: tuple[list[RunRequest], StudyOutcome], fast: Path, tmp_path: Path
 ) -> None:

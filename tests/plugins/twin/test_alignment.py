@@ -111,10 +111,12 @@ def called(trials: Trials, worlds: list[dict[str, float]]) -> list[MisfitCheck]:
     return [check for check in found if check.found]
 
 
+@pytest.mark.long
 def test_a_clean_pilot_has_no_misfit(clean: Trials, worlds: list[dict[str, float]]) -> None:
     assert called(clean, worlds) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("shown", "title"),
     [
@@ -153,6 +155,7 @@ def test_sizes_of_a_camera_that_is_not_aligned() -> None:
     assert seen(bent(0.015))["distortion"] == pytest.approx(-found / 2.0, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [0.03, -0.03])
 def test_late_frames_are_named(
     seconds: float, clean: Trials, worlds: list[dict[str, float]]
@@ -179,6 +182,7 @@ def test_delays_have_their_size() -> None:
     assert np.isnan(forces(drawn()))
 
 
+@pytest.mark.long
 def test_late_and_turned_forces_are_named(worlds: list[dict[str, float]]) -> None:
     (first, *_) = called(pulled(drawn(), late_s=0.02), worlds)
     assert first.title == "forces late or early against the arm's poses"
@@ -189,6 +193,7 @@ def test_late_and_turned_forces_are_named(worlds: list[dict[str, float]]) -> Non
     assert force_turn_deg(slips) == pytest.approx(8.0, abs=0.2)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("worn", [0.2, -0.1])
 def test_friction_that_drifts_shows_in_lags(worn: float, clean: Trials) -> None:
     contact, plain = read_contact(drawn(worn=worn)), read_contact(clean)
@@ -198,6 +203,7 @@ def test_friction_that_drifts_shows_in_lags(worn: float, clean: Trials) -> None:
     assert contact_trends(plain.slips, plain.steady)[LAG] < 2.0
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("weaker", "most"), [(0.0, 3.0), (0.2, np.inf), (-0.1, np.inf)])
 def test_stiffness_that_drifts_shows_in_forces_over_lags(weaker: float, most: float) -> None:
     contact = read_contact(pulled(drawn(friction=0.7), weaker=weaker))
@@ -252,6 +258,7 @@ def rolled(trials: Trials, deg: float) -> list[PilotTrial]:
     ]
 
 
+@pytest.mark.long
 def test_a_turned_event_picture_has_its_size() -> None:
     _, plain = read_camera(seen_by_events())
     assert plain[PICTURE_TURN] == pytest.approx(0.0, abs=0.2)
@@ -259,6 +266,7 @@ def test_a_turned_event_picture_has_its_size() -> None:
     assert found[PICTURE_TURN] == pytest.approx(5.0, abs=0.2)
 
 
+@pytest.mark.long
 def test_noise_and_contrast_that_drift_show() -> None:
     _, plain = read_camera(seen_by_events())
     assert plain[NOISE_TREND] < 3.0

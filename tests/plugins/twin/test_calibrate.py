@@ -128,6 +128,7 @@ def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) 
     assert len(seen.camera.events) == pytest.approx(len(made.camera.events), rel=0.2)
 
 
+@pytest.mark.long
 def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +183,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
     assert "the twin was fitted on" in said["twin"] or "within what" in said["twin"]
 
 
+@pytest.mark.long
 def test_no_interval_where_a_misfit_touches_its_parameter(
     store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,6 +305,7 @@ def test_a_misfit_ends_with_exit_code_1(
     assert TwinFit.load(tmp_path / "twin.json") == fit
 
 
+@pytest.mark.long
 def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
     store: Store, tmp_path: Path
 ) -> None:

@@ -147,6 +147,7 @@ def estimated() -> dict[str, float]:
     return camera_estimates(pilot())
 
 
+@pytest.mark.long
 def test_discs_that_sweep_give_all_numbers_of_the_picture() -> None:
     found = estimated()
     assert found["px_per_mm"] == pytest.approx(PX_PER_MM, rel=0.002)
@@ -167,6 +168,7 @@ def test_discs_that_sweep_give_all_numbers_of_the_picture() -> None:
     assert np.isnan(found["scan_us"])
 
 
+@pytest.mark.long
 def test_pixels_that_are_busy_in_the_slide_alone_are_not_hot() -> None:
     """As where the rim of a disc passes that was not found in its place."""
     x, y = np.divmod(np.arange(400), 20)
@@ -380,6 +382,7 @@ def test_markers_that_are_seen_in_some_frames_only_are_enough() -> None:
     assert found == pytest.approx(whole, nan_ok=True)
 
 
+@pytest.mark.long
 def test_estimates_of_a_simulated_rig(root: Path) -> None:
     """Four slides of each depth, one world, the numbers of its rig file."""
     rig, _ = load_rig_file(root / "rigs" / "mock_force.yaml")

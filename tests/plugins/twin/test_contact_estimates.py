@@ -348,6 +348,7 @@ def test_lags_alone_tell_steps_but_no_force() -> None:
     np.testing.assert_allclose(inside, outer.mean() - outer, atol=0.01)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("seed", range(5))
 def test_an_exact_depth_zero_shows_how_much_later_the_rings_touch(seed: int) -> None:
     """Depth zero is where the centre papilla touches, whatever height that came out with."""

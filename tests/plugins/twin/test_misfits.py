@@ -156,6 +156,7 @@ def test_a_pilot_without_effects_has_small_numbers(clean: dict[str, float]) -> N
     assert np.isnan(clean[LIGHT])
 
 
+@pytest.mark.long
 def test_a_tilted_plate_is_a_plane_through_the_gaps(clean: dict[str, float]) -> None:
     slope = np.tan(np.radians(1.0))
     found = numbers(pilot(raised_mm=slope * LATTICE @ [0.6, 0.8]))
@@ -175,6 +176,7 @@ def test_a_sticky_papilla_stands_out(clean: dict[str, float], papilla: int) -> N
     assert found[SPOT] < 8.0
 
 
+@pytest.mark.long
 def test_a_papilla_without_a_marker_or_a_hold_is_missing() -> None:
     whole = pilot()
     unseen = []
@@ -199,6 +201,7 @@ def test_a_spot_shows_where_it_is(clean: dict[str, float]) -> None:
     assert found[BROKEN] == 0.0
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("ramp_mm_s2", [1.0, 5.0, 20.0])
 def test_a_ramp_costs_half_its_square_of_speed(ramp_mm_s2: float) -> None:
     expected = np.mean(np.square(SPEEDS)) / (2.0 * ramp_mm_s2)
@@ -228,7 +231,7 @@ def lit(share: float, hz: float = 100.0, scans_hz: float = 0.0, seed: int = 0) -
     return found
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("hz", [50.0, 100.0, 120.0, 333.0])
 def test_a_light_makes_a_line(hz: float) -> None:
     # the largest of 481 means of 32 logarithms; a light of a tenth would be 4 times the noise
@@ -237,6 +240,7 @@ def test_a_light_makes_a_line(hz: float) -> None:
     assert line_over_noise(lit(0.2, hz)) > 3.0 * quiet
 
 
+@pytest.mark.long
 def test_scans_of_a_read_out_make_no_line() -> None:
     for scans_hz in (3333.0, 4990.0, 5000.0, 6600.0):
         assert line_over_noise(lit(0.0, scans_hz=scans_hz)) < 1.8
@@ -330,6 +334,7 @@ def worlds(k: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], F6
     return [dict(zip(keys, row, strict=True)) for row in rows.tolist()], s
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("k", [40, pytest.param(200, marks=pytest.mark.long)])
 def test_false_alarms_keep_to_the_level(k: int) -> None:
     rng = np.random.default_rng(k)

@@ -112,6 +112,7 @@ def test_a_linear_gaussian_posterior_is_the_closed_form() -> None:
     assert np.mean(correlations) == pytest.approx(expected, abs=0.1)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("toy", "p", "k"),
     [

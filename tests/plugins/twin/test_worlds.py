@@ -32,11 +32,13 @@ def zero_errors_mm(rig: RigFile, seeds: Iterable[int]) -> list[float]:
         made.close()
 
 
+@pytest.mark.long
 def test_the_shipped_rigs_touch_depth_is_that_of_its_camera_and_skin() -> None:
     rig, _ = load_rig_file(shipped_rigs()["rehearsal"])
     assert touch_depth_mm(rig) == pytest.approx(rig.calibration.touch_depth, abs=0.03)
 
 
+@pytest.mark.long
 def test_depth_zero_is_right_with_the_rigs_own_touch_depth() -> None:
     rig, _ = load_rig_file(shipped_rigs()["rehearsal"])
     # a softer skin, seen smaller and fainter, is noticed deeper

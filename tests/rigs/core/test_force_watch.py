@@ -221,7 +221,7 @@ def figures(found: list[Pressed]) -> tuple[float, float, float]:
 
 
 def test_presses_end_at_their_force_and_below_the_limit() -> None:
-    worst, share, peak = figures(presses(20, a_rig=10))
+    worst, share, peak = figures(presses(10, a_rig=10))
     assert worst < 0.1
     assert share == 1.0
     assert peak <= LIMIT_N

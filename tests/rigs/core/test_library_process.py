@@ -81,6 +81,7 @@ def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None
     process.close()
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("ignore_suspend", [False, True])
 @pytest.mark.parametrize("name", ["half", "drip"])
 def test_answer_that_does_not_end_has_one_deadline(name: str, ignore_suspend: bool) -> None:

@@ -58,6 +58,7 @@ def test_half_of_the_ticks_have_a_pulse() -> None:
     assert code_bits(77, HOUR).mean() == pytest.approx(0.5, abs=0.003)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("code", "bits", "length"), [("lfsr", 1, 60), ("irregular", 3, 20)])
 def test_trials_share_no_stretch_of_the_code(code: Code, bits: int, length: int) -> None:
     """Of 500 trials of 20 s no two have the same 60 ticks, or 20 intervals, anywhere."""

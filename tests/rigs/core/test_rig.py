@@ -268,6 +268,7 @@ FAR_CAMERA: dict[str, Any] = {
 REZERO = {"every": 48, "speed": "0.5 mm/s", "search": "1.5 mm"}
 
 
+@pytest.mark.long
 def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
     rig = make_rig(**FAR_CAMERA)
     found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 7)]
@@ -275,6 +276,7 @@ def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
     assert max(found) < 0.4
 
 
+@pytest.mark.long
 def test_depth_zero_is_the_mean_of_as_many_touches_as_asked_for() -> None:
     """Of three touches it is within four standard errors of the mean of 9 others."""
     rig = make_rig(**FAR_CAMERA)
@@ -294,6 +296,7 @@ def test_one_touch_is_what_it_was(rig: Rig) -> None:
     assert (found.mm, found.sd_mm) == (rig.touch_off(0.5, 1.5, 3), None)
 
 
+@pytest.mark.long
 def test_touching_off_in_much_noise_finds_the_surface_nevertheless() -> None:
     """In 50 ms nothing shows with the first of these seeds, and too late with the others."""
     rig = make_rig(event_camera={"noise_hz": 0.1})
@@ -347,7 +350,7 @@ def test_a_twist_that_is_stopped_comes_straight_out_and_turns_back_in_the_next_t
     assert angle_deg(rig.arm.pose(), Pose(stood.xyz_mm, straight)) < 1e-6
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", [name for name in shipped_rigs() if name.startswith("mock")])
 def test_a_simulated_rig_is_freed_once_nobody_has_it(name: str) -> None:
     """Without the garbage collector, which sees few objects and not their megabytes."""

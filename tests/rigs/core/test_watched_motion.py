@@ -150,7 +150,7 @@ def test_limit_of_force_stops_any_motion(motion: Callable[[Rig], None]) -> None:
     assert rig.position().depth_mm < 0.0  # moved clear
 
 
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 @each_motion
 def test_motion_below_the_limit_runs_to_its_end(motion: Callable[[Rig], None]) -> None:
     rig = make_rig(limit_n=30.0)
@@ -763,6 +763,7 @@ def test_fingers_close_no_deeper_than_the_rigs_limit() -> None:
             rig.move_fingers(*wrong)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("motion", [warm_up, touching_off, taught_touch, circles])
 def test_fingers_are_opened_before_any_contact(motion: Callable[[Rig], None]) -> None:
     """A gripper that was closed by hand holds the sensor deeper than the arm's depth shows."""
@@ -831,6 +832,7 @@ def frozen(chunk: EventChunk) -> EventChunk:
     return replace(chunk, t_us=np.zeros_like(chunk.t_us))
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("then", [nothing, frozen])
 @pytest.mark.parametrize(
     "seek",

@@ -35,6 +35,7 @@ def ignored(pid: int) -> set[int]:
     return {number for number in range(1, 65) if mask >> (number - 1) & 1}
 
 
+@pytest.mark.long
 def test_simulation_server_survives_signals_of_the_terminal(tmp_path: Path) -> None:
     with stage_of(load_rig_file(rig_yaml(tmp_path))[0]) as stage:
         pid = stage._process.pid

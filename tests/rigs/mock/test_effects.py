@@ -60,6 +60,7 @@ def sound() -> Trial:
     return slide(build_mock(SMALL), seed=11)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("fault", EFFECTS, ids=lambda fault: str(fault["kind"]))
 def test_an_effect_is_the_same_in_any_pieces_and_in_its_trial_only(
     fault: dict[str, Any], sound: Trial
@@ -166,6 +167,7 @@ def test_a_plate_tilted_against_what_was_taught_presses_one_side_deeper() -> Non
 # -- the light -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_light_on_the_mains_is_seen_by_pixels_with_low_thresholds() -> None:
     share = 0.08
     swing = math.log((1 + share) / (1 - share))

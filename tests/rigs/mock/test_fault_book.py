@@ -55,6 +55,7 @@ def sound() -> Trial:
     return slide(build_mock(SMALL), seed=11)
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize("fault", MOMENTS.strip().splitlines())
 def test_a_fault_is_the_same_in_any_pieces(fault: str, sound: Trial) -> None:
     devices = with_faults({**fault_of(fault), "at_s": 0.7213})

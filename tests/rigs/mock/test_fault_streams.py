@@ -125,6 +125,7 @@ def test_a_burst_has_its_rate_and_covers_the_array(sound: Trial) -> None:
 # -- clocks and pulses ---------------------------------------------------------------------
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("seconds", [0.25, -0.25])
 @pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera", "sync_box"])
 def test_a_clock_jumps_on_one_device(device: str, seconds: float, sound: Trial) -> None:
@@ -238,6 +239,7 @@ def test_a_box_that_drifts_ticks_faster_for_everybody(sound: Trial) -> None:
         assert early == pytest.approx(expected, abs=1200)  # cut to microseconds, and their drifts
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("device", ["event_camera", "arm", "sync_box"])
 def test_pulses_are_lost_doubled_and_late_on_one_device(device: str, sound: Trial) -> None:
     for kind, seconds in (("lost", None), ("duplicated", 0.004), ("late", 0.004)):

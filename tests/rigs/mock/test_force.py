@@ -327,6 +327,7 @@ def steps_within(
     return steps, maps
 
 
+@pytest.mark.long
 def test_a_force_step_is_timed_against_the_events(tmp_path: Path) -> None:
     steps, maps = steps_within(tmp_path, 8)
     assert (steps, maps) == (8, 8)

@@ -138,7 +138,7 @@ def compare(
     return np.abs(np.concatenate(errors))
 
 
-@pytest.mark.quick(4)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("path", [there_and_back, jump, shake])
 @pytest.mark.parametrize("cutoff_hz", [5.0, 40.0, 1000.0])
 def test_a_slow_pixel_follows_its_differential_equation(path: Path, cutoff_hz: float) -> None:

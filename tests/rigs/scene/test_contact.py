@@ -44,6 +44,7 @@ def test_zero_speed_leaves_the_state_to_the_bit(level: int) -> None:
     assert np.array_equal(places(track)[0], places(track)[-1])
 
 
+@pytest.mark.long
 def test_slip_starts_at_mu_n_over_k_on_a_straight_path_whatever_the_step() -> None:
     skin = ideal_skin()
     springs = springs_of(skin, level=1)

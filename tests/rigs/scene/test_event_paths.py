@@ -96,6 +96,7 @@ def errors_us(events: Events, path: Path, end_s: float, pixels: int) -> np.ndarr
     return np.concatenate(errors)
 
 
+@pytest.mark.long
 def test_a_vibrating_marker_fires_within_a_microsecond() -> None:
     events = sensed(vibrating, 1600, 4)
     error = np.abs(errors_us(events, vibrating, 1.6, 120))
@@ -144,6 +145,7 @@ def test_a_reversal_between_two_rows_is_found() -> None:
     assert last_on < 48_000_000 < first_off
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("kind", "least", "most"), [("chord", 1.7, 2.3), ("cubic", 3.7, 5.0)])
 def test_the_order_of_event_times(kind: str, least: float, most: float) -> None:
     """Five swings of a marker; medians of errors of times against Brent's roots."""

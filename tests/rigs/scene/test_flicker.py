@@ -117,6 +117,7 @@ def test_a_moving_marker_and_the_light_add_their_events() -> None:
     assert np.array_equal(together[:, order], found[:, np.lexsort(found)])
 
 
+@pytest.mark.long
 def test_a_light_keeps_the_refractory_period_and_the_scans() -> None:
     optics = EventOptics(
         **{**SMALL, "threshold": 0.05, "refractory_us": 500.0, "readout_hz": 5000.0}
@@ -132,6 +133,7 @@ def test_a_light_keeps_the_refractory_period_and_the_scans() -> None:
     assert len(set((t_ns - (x * optics.column_ns).astype(np.int64)) % 200_000)) == 1
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(
     first=st.integers(0, 100),

@@ -90,6 +90,7 @@ TURNS = {"none": 60, "relaxation": 90, "no static": 90, "static": 110, "much sta
 FURTHER = [("no static", 30, 1.0), ("all", 150, 4.0), ("strengthening", 180, 3.0)]
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("switch", "angle_deg", "speed"), [*((*turn, 1.0) for turn in TURNS.items()), *FURTHER]
 )

@@ -153,6 +153,7 @@ def near(found: np.ndarray, expected: np.ndarray, *, rel: float, abs: float) -> 
     return bool(np.all(close | np.isclose(found, expected, rtol=0.0, atol=abs)))
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

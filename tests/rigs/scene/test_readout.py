@@ -51,7 +51,7 @@ def scanned(true: Events, scans: ScanTimes, end_ns: int) -> Events:
     return t_ns, x, y, p
 
 
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("scan_us", [0.0, 192.0])
 @pytest.mark.parametrize("readout_hz", [1000.0, 3000.0, 5000.0, 10_000.0])
 def test_scans_carry_the_true_events(readout_hz: float, scan_us: float) -> None:

@@ -89,6 +89,7 @@ def test_shorter_steps_change_a_crossing_by_a_step_at_most(factor: float) -> Non
     assert away[-1].max() < 2 * SPEED * 4e-3
 
 
+@pytest.mark.long
 def test_a_plate_that_is_one_spot_has_other_friction() -> None:
     skin, factor = ideal_skin(), 0.6
     spot = spotted(springs_of(skin, 3, **RICH), (0.0, 0.0, 100.0, factor))

@@ -107,6 +107,7 @@ def test_counts_of_a_table_of_readings_say_what_to_write(tmp_path: Path) -> None
     assert "readings of pressures or forces are streams under scalars or wrenches" in done.stderr
 
 
+@pytest.mark.long
 def test_later_steps_give_a_result_or_one_line(campaign: Campaign, tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert verify(Store.open(store)) == []

@@ -259,6 +259,7 @@ def test_angles_in_degrees_and_places_in_mm_stay_as_they_are(tmp_path: Path) -> 
     assert recording.record.clocks.arm.uncertainty_ns is None
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("clock", "uncertainty_ns"),
     [

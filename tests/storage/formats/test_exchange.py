@@ -252,6 +252,7 @@ def test_packets_of_any_length(tmp_path: Path, lengths: list[int]) -> None:
         np.testing.assert_array_equal(joined, getattr(events, name))
 
 
+@pytest.mark.quick(7)
 @pytest.mark.parametrize("at", [0, 299, 300, 66_000, 69_999])
 @pytest.mark.parametrize(
     ("column", "value"),
@@ -290,6 +291,7 @@ def test_zstd_frames_that_say_a_wrong_size(tmp_path: Path, size: int) -> None:
         list(file.events(0))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("later", [1_795_000_000_000_000, 3 * 86_400 * 10**6])
 def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, later: int) -> None:
     column = np.arange(300, dtype=np.uint16)
@@ -483,6 +485,7 @@ BAD: dict[str, Callable[[Path], Path]] = {
 }
 
 
+@pytest.mark.quick(6)
 @pytest.mark.parametrize("name", BAD)
 @pytest.mark.usefixtures("small")
 def test_damaged_and_hostile_files_leave_nothing(tmp_path: Path, name: str) -> None:

@@ -104,6 +104,7 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
     assert kind_of(tmp_path / "d.aedat4") == "aedat4"
 
 
+@pytest.mark.long
 def test_file_of_the_core_loads_no_other_format(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4")
     file, store = str(tmp_path / "a.aedat4"), str(tmp_path / "store")

@@ -390,6 +390,7 @@ def _csv(folder: Path, change: Callable[[list[str]], list[str]]) -> Path:
     return path
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     "row", ["x,1,1,1", "0.5,1,1", "0.5,1,1,1,1,1", ",1,1,1", "nan,1,1,1", "0.5,,1,1"]
 )
@@ -506,6 +507,7 @@ GATES: dict[str, tuple[str, Any, Any, Any, set[str]]] = {
 }
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("case", GATES)
 def test_times_and_frames_that_cannot_be_meant_fail_their_gate(tmp_path: Path, case: str) -> None:
     name, write, times, more, gates = GATES[case]

@@ -139,6 +139,7 @@ def _cut(folder: Path, name: str, data: bytes, at: int) -> int:
     return _is_prefix(saved.found)
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_cut_short_gives_a_prefix(tmp_path: Path, name: str, seed: int, whole: Any) -> None:
@@ -161,6 +162,7 @@ def test_most_of_a_file_without_its_end_is_salvaged(tmp_path: Path, name: str, w
     assert _cut(tmp_path, name, whole[name], at) >= share * COUNT
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", FILES)
 def test_flipped_bits_give_no_traceback_and_where_seen_a_prefix(

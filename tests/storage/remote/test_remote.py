@@ -79,6 +79,7 @@ def the(store: Store) -> Campaign:
     return store.campaign("c")
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", ["s3", "file", "memory"])
 def test_what_is_pulled_is_what_was_pushed(
     kind: str, endpoint: str, store: Store, tmp_path: Path
@@ -414,6 +415,7 @@ def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_
     assert check_url("s3://a/b/") == "s3://a/b"
 
 
+@pytest.mark.long
 def test_secrets_are_nowhere(endpoint: str, store: Store, tmp_path: Path) -> None:
     url = new_bucket(endpoint)
     push(store, Remote(url))

@@ -82,6 +82,7 @@ def damage(folder: Path, how: str, place: str, text: str = "") -> None:
         {"make": Path.mkdir, "flip": _flip}[how](path)
 
 
+@pytest.mark.quick(15)
 @pytest.mark.parametrize(("change", "says", "kind"), rows(DAMAGE))
 def test_verify_names_it_and_what_is_whole_stays_readable(
     change: str, says: str, kind: str, tmp_path: Path

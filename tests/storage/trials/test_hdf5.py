@@ -183,7 +183,7 @@ SPARSE = {
 }
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", SPARSE)
 def test_a_gap_costs_neither_memory_nor_a_window(name: str, tmp_path: Path) -> None:
     whole = _sparse(SPARSE[name])
@@ -214,6 +214,7 @@ def test_only_a_file_whose_index_ends_early_has_the_newer_format(tmp_path: Path)
         assert (whole.attrs["format"], cut.attrs["format"]) == (2, 3)
 
 
+@pytest.mark.long
 def test_a_long_file_with_the_full_index_of_older_versions_reads_the_same(tmp_path: Path) -> None:
     whole = _sparse([0, 5, 2**32 - 700, 2**32 + 700, 2**32 + 1_000_000, 2**32 + 1_999_999])
     write(tmp_path / "t.h5", whole, 1)

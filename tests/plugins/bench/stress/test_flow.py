@@ -127,6 +127,7 @@ def test_what_cannot_be_judged_is_refused_before_anything_is_taken(
     assert not (tmp_path / "out" / "store" / "campaigns").exists()
 
 
+@pytest.mark.long
 def test_a_campaign_with_nuisances_trains_only_if_it_is_asked_for(
     rig_path: Path, tmp_path: Path
 ) -> None:

@@ -95,6 +95,7 @@ def test_normal_figures_take_as_many_trials_as_foretold() -> None:
     assert inside >= 12
 
 
+@pytest.mark.long
 def test_a_claim_that_is_certain_needs_few_trials() -> None:
     plan = plan_of([{"figure": "first_slip", "statistic": "p90", "at_most": "5 s"}])
     (found,) = power_of(plan, normal_pilot(plan, 36, 1))
@@ -110,6 +111,7 @@ def test_a_claim_that_is_false_is_refuted() -> None:
     assert found.refuted == 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("within", "repetitions", "campaigns"),
     [("50 ms", 12, 6), pytest.param("20 ms", 60, 20, marks=pytest.mark.long)],
@@ -151,6 +153,7 @@ def test_an_estimate_at_what_is_claimed_is_never_called() -> None:
     assert more_trials(claim, at.model_copy(update={"low": None})) == np.inf
 
 
+@pytest.mark.long
 def test_undetected_trials_come_as_often_as_in_the_pilot() -> None:
     """At one depth nothing is detected in half of the trials; a sixth of the campaign's then."""
     plan = plan_of([{"figure": "latency_gross", "at_most": "100 ms"}])
@@ -280,6 +283,7 @@ def median_trials(campaigns: list[CampaignDraw]) -> float:
     return float(np.median([it.called[0] or np.inf for it in campaigns]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("campaigns", [3, pytest.param(10, marks=pytest.mark.long)])
 def test_sessions_that_differ_need_more_trials(campaigns: int) -> None:
     plan = plan_of([{"figure": "first_slip", "within": "80 ms"}], repetitions=120)
@@ -290,6 +294,7 @@ def test_sessions_that_differ_need_more_trials(campaigns: int) -> None:
     assert drawn(plan, pilot, Sessions(6, 1.0), 1) == apart[:1]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("collection", [{}, {"order": "adaptive"}])
 def test_sessions_without_differences_and_drift_change_nothing(collection: dict[str, Any]) -> None:
     plan = plan_of([MEDIAN], repetitions=20, **collection)

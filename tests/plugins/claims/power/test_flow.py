@@ -65,6 +65,7 @@ def test_figures_are_made_once_and_the_page_says_simulated(
     assert answer("power", *words, "--claim", DURATION)["ended"] == list(record.ended)
 
 
+@pytest.mark.long
 def test_a_plan_says_it_with_its_hours(ran: Ran, protocol: Path) -> None:
     store = ran[0][0].store
     refused = here("plan", protocol, "--pilot", store, "--json")
@@ -101,6 +102,7 @@ def test_a_claim_that_cannot_be_had_is_said_so(ran: Ran, protocol: Path, tmp_pat
     assert "Cannot be had by this plan" in (tmp_path / "power.html").read_text()
 
 
+@pytest.mark.long
 def test_a_network_is_not_asked_about_trials_that_trained_it(
     ran: Ran, protocol: Path, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ def test_an_error_that_rises_has_no_gain_to_expect() -> None:
     assert curve.error(np.array([1e6]))[0] == pytest.approx(0.115)
 
 
+@pytest.mark.long
 def test_what_more_trials_give_is_in_the_interval() -> None:
     inside = 0
     for world in range(8):

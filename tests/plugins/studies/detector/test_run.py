@@ -206,6 +206,7 @@ def test_a_kept_search_is_not_made_again_and_grows(
     assert STUDY.write(found).exists()
 
 
+@pytest.mark.long
 def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
     axes = Axes(length_ms=(30,), step_ms=(5,), pool_px=(40,), width=(0.5,))
     ask = SearchSize(samples=30, epochs=3, trials=1, seeds=1, stride_ms=30)

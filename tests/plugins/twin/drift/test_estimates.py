@@ -20,6 +20,7 @@ def simulated(
     return places, 0.3 + slope * places + noise, variances
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("k", [4, 10])
 @pytest.mark.parametrize("scatter", [0.0, 0.03])
 def test_intervals_hold_and_false_alarms_are_as_many_as_said(k: int, scatter: float) -> None:
@@ -55,6 +56,7 @@ def test_a_line_takes_three_values() -> None:
         line_through(np.zeros(3), np.arange(3.0), np.ones(3))
 
 
+@pytest.mark.long
 def test_a_slope_is_not_taken_towards_the_prior() -> None:
     """Though half of the prior's interval is left of each fit."""
     rng = np.random.default_rng(3)

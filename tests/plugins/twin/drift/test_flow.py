@@ -139,6 +139,7 @@ def test_friction_that_falls_is_found_and_nothing_else(
     assert "friction stands for friction over the stiffness" in " ".join(page.split())
 
 
+@pytest.mark.long
 def test_a_limit_that_is_exceeded_is_exit_1(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
@@ -172,6 +173,7 @@ def fitted(folder: Path) -> None:
     drift.calibrate_drift(store, item, rig, worlds=100, spread=0.5, seed=1)
 
 
+@pytest.mark.long
 def test_a_campaign_without_references_to_fit_is_refused(tmp_path: Path) -> None:
     rig = rig_file(tmp_path / "rig.yaml")
     without = tiny()

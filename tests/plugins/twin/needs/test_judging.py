@@ -73,6 +73,7 @@ def test_an_effect_without_consequence_is_not_shown() -> None:
     assert found.verdict == "not shown"
 
 
+@pytest.mark.long
 def test_false_calls_of_effects_that_are_not_there() -> None:
     # slight effects are the hard ones: strong ones are far off
     rng = np.random.default_rng(5)

@@ -134,6 +134,7 @@ def test_what_the_guard_forbids_is_never_sent(abb_pair: MakeAbb) -> None:
     assert not robot.running
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("kind", "state"),
     [
@@ -156,6 +157,7 @@ def test_a_stop_from_outside_ends_the_path(abb_pair: MakeAbb, kind: Kind, state:
         reconnect(arm)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(abb_pair: Any, kind: Kind) -> None:
     arm, robot = abb_pair(arm={"watchdog_s": None})
@@ -169,6 +171,7 @@ def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(abb_pair: Any, 
     assert robot.moving()  # nothing on the controller knows
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 @pytest.mark.parametrize("stage", [Stage.CONNECTING, Stage.UPLOADING])
 def test_a_link_lost_while_connecting_or_uploading(abb_pair: Any, kind: Kind, stage: Stage) -> None:

@@ -72,6 +72,7 @@ def send(sender: str, to: str, data: bytes) -> None:
 # -- connecting --------------------------------------------------------------------------------
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_connecting_again_finds_a_loss_that_nobody_noticed(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = abb_pair()
@@ -85,6 +86,7 @@ def test_connecting_again_finds_a_loss_that_nobody_noticed(abb_pair: MakeAbb, ki
     reconnect(arm)
 
 
+@pytest.mark.long
 def test_connecting_again_stops_an_arm_that_was_lost_on_its_way(abb_pair: MakeAbb) -> None:
     arm, robot = sliding(*abb_pair(arm={"watchdog_s": 1.0}))
     robot.inject(Kind.SILENCE)
@@ -98,6 +100,7 @@ def test_connecting_again_stops_an_arm_that_was_lost_on_its_way(abb_pair: MakeAb
 # -- stopping ------------------------------------------------------------------------------
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_stop_after_a_lost_link_was_noticed_is_a_fault(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = sliding(*abb_pair(arm={"watchdog_s": None}))
@@ -128,6 +131,7 @@ def test_a_path_thread_that_fails_says_so_and_stops_the_arm(
     until(lambda: not robot.moving(), settings.STOPPED_S + BUSY_S)
 
 
+@pytest.mark.long
 def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
     """The controller takes the start and is never heard of again."""
     arm, robot = abb_pair(arm={"watchdog_s": None})
@@ -137,6 +141,7 @@ def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
     fails(arm.stop, 8 * REQUEST_S, "cannot be reached to stop it")
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_the_controller_stops_the_arm_when_the_link_is_lost(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = sliding(*abb_pair())
@@ -150,6 +155,7 @@ def test_the_controller_stops_the_arm_when_the_link_is_lost(abb_pair: MakeAbb, k
     arm.stop()
 
 
+@pytest.mark.long
 def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeAbb) -> None:
     arm, robot = sliding(*abb_pair())
     robot.web_on = False
@@ -158,6 +164,7 @@ def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeA
     assert not robot.moving()
 
 
+@pytest.mark.long
 def test_stop_does_not_wait_for_a_path_that_is_being_sent(abb_pair: MakeAbb) -> None:
     """And the arm does not move after it."""
     arm, robot = abb_pair()
@@ -195,6 +202,7 @@ def test_the_controller_stops_the_arm_when_the_program_is_killed(abb_pair: MakeA
     assert 40.0 * 0.5 < gone_mm < 40.0 * 1.3
 
 
+@pytest.mark.long
 def test_a_stop_for_want_of_beats_is_told(abb_pair: MakeAbb) -> None:
     arm, _ = sliding(*abb_pair())
     arm._watchdog.pause()
@@ -322,6 +330,7 @@ def test_motors_that_are_switched_off_end_the_path(abb_pair: MakeAbb) -> None:
 # -- web services --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_sessions_are_logged_out_of(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     for _ in range(5):

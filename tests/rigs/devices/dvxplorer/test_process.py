@@ -84,6 +84,7 @@ def ports(events: tuple[bytes | None, ...]) -> Iterator[tuple[Port, DvxplorerSet
         second.close()
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("greeting", "message"),
     [

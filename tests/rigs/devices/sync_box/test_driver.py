@@ -84,6 +84,7 @@ def test_it_is_a_sync_box(box: SerialSyncBox) -> None:
     assert isinstance(box, SyncBox)
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("code", CODES)
 @pytest.mark.parametrize("rate_hz", [200.0, 1000.0, 333.333])
 def test_its_pulses_are_the_codes(box: SerialSyncBox, code: Code, rate_hz: float) -> None:
@@ -404,6 +405,7 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
     assert box.losses.lines > 10
 
 
+@pytest.mark.quick(5)
 @pytest.mark.parametrize(
     "line",
     [

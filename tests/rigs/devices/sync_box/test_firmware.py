@@ -189,6 +189,7 @@ def test_at_100_hz_every_edge_is_160000_cycles_from_the_last(
     assert not box.losses
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("rate_hz", [MOST_HZ, ALL_TO_HZ, 333.333, 1.5])
 def test_any_rate_is_kept_to_the_cycle(run: Run, connect: Connect, rate_hz: float) -> None:
     """A period that is no whole number of cycles is spread: no tick is off by a cycle or more."""
@@ -205,6 +206,7 @@ def test_any_rate_is_kept_to_the_cycle(run: Run, connect: Connect, rate_hz: floa
     assert not box.losses
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("delay", [1, 100, 1234, 65_536])
 def test_exposures_are_stamped_to_the_microsecond(run: Run, connect: Connect, delay: int) -> None:
     board = run(delay=delay)

@@ -78,6 +78,7 @@ def test_a_slide_at_1_6_mm_s_is_straight_and_at_its_speed(
     check_slide(robot_of, arm_on, 1.6, rate)
 
 
+@pytest.mark.long
 def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(robot_of: Any, arm_on: MakeArm) -> None:
     check_slide(robot_of, arm_on, 0.6, rate=5.0)  # 25 s of controller time
 
@@ -230,6 +231,7 @@ def test_a_moving_arm_takes_no_second_path(robot_of: MakeRobot, arm_on: MakeArm)
         arm.start([Segment(at(0.0), 1.6)])
 
 
+@pytest.mark.long
 def test_two_robots_have_two_addresses(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     one, other = arm_on(robot_of(rate=5.0)), arm_on(robot_of(rate=5.0))
     one.start([Segment(at(5.0), 20.0)])

@@ -58,6 +58,7 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> float:
     return took
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("kind", "state"),
     [
@@ -100,6 +101,7 @@ def test_connecting_again_unlocks_nothing_and_needs_a_person_first(ur_pair: Make
     assert len(arm.progress().finished) == 1
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
     arm, robot = ur_pair(faults=[Fault(kind, Stage.MOVING, after_mm=1.0)])
@@ -115,6 +117,7 @@ def test_a_link_lost_while_sliding(ur_pair: MakeUr, kind: Kind) -> None:
     assert distance_mm(robot.pose(), where) < 1e-6  # the client did not send the move again
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
     arm, robot = ur_pair()
@@ -127,6 +130,7 @@ def test_a_link_lost_while_idle(ur_pair: MakeUr, kind: Kind) -> None:
     reconnect(arm)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 @pytest.mark.parametrize(
     ("stage", "within_s"),
@@ -268,6 +272,7 @@ def test_a_slider_that_is_moved_while_sliding_ends_the_path(ur_pair: MakeUr) -> 
     assert not robot.moving()
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_controller_clock_that_falls_back_ends_the_stream(ur_pair: MakeUr, moving: bool) -> None:
     """A segment that began before and ended after would have a negative length."""
