@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.clocks.clock_bounds import fit_bounds
+from sliplab.plugins.ati_net_ft import rdt
+from sliplab.plugins.ati_net_ft.driver import AtiNetFt
+from sliplab.plugins.ati_net_ft.fake import FakeNetFt, SensorFaultKind
+from sliplab.plugins.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
-from sliplab.rigs.devices.ati_net_ft import rdt
-from sliplab.rigs.devices.ati_net_ft.driver import AtiNetFt
-from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt, SensorFaultKind
-from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.storage.streams import WrenchChunk
 from tests.rigs.waiting import own_address, until
 

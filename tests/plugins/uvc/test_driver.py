@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from sliplab.plugins.uvc import DRIVER, driver
+from sliplab.plugins.uvc.capture import Capture, configure
+from sliplab.plugins.uvc.driver import UvcCamera
+from sliplab.plugins.uvc.fake import VideoPipe
+from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import FrameCamera, RigError
 from sliplab.rigs.core.registry import find_driver
-from sliplab.rigs.devices.uvc import DRIVER, driver
-from sliplab.rigs.devices.uvc.capture import Capture, configure
-from sliplab.rigs.devices.uvc.driver import UvcCamera
-from sliplab.rigs.devices.uvc.fake import VideoPipe
-from sliplab.rigs.devices.uvc.settings import UvcSettings
 
 Until = Callable[[Callable[[], bool]], None]
 SMALL: dict[str, Any] = {"width_px": 64, "height_px": 48}

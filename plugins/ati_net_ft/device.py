@@ -1,15 +1,15 @@
-"""ATI Net F/T force/torque sensors: Raw Data Transfer (RDT) over UDP, and their web page."""
+"""Declaration of the driver; cheap to import."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from sliplab.plugins.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.core.driver import ForceSensorDriver, lazy
 from sliplab.rigs.core.network import answers
-from sliplab.rigs.devices.ati_net_ft.settings import AtiNetFtSettings
 
-_sensor = lazy("sliplab.rigs.devices.ati_net_ft.driver:AtiNetFt")
-_fake = lazy("sliplab.rigs.devices.ati_net_ft.fake:FakeNetFt")
+_sensor = lazy("sliplab.plugins.ati_net_ft.driver:AtiNetFt")
+_fake = lazy("sliplab.plugins.ati_net_ft.fake:FakeNetFt")
 
 
 def _ping(settings: AtiNetFtSettings) -> str | None:

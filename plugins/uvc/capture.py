@@ -18,8 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.host_clock import StallTimer
-from sliplab.rigs.devices.uvc.settings import UvcSettings
 from sliplab.storage.streams import I64, U8, Json
 
 EXPOSURE_UNIT_US = 100.0

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sliplab.plugins.uvc.capture import Taken
+from sliplab.plugins.uvc.settings import UvcSettings, is_camera
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
-from sliplab.rigs.devices.uvc.capture import Taken
-from sliplab.rigs.devices.uvc.settings import UvcSettings, is_camera
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 DEVICE = "frame camera"
@@ -68,7 +68,7 @@ class UvcCamera:
             DEVICE,
             lambda: LibraryProcess(
                 "OpenCV",
-                "sliplab.rigs.devices.uvc.capture:serve",
+                "sliplab.plugins.uvc.capture:serve",
                 (settings.model_dump_json(),),
                 OPEN_S,
                 ignore_suspend=True,

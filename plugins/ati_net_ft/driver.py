@@ -21,12 +21,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplab.plugins.ati_net_ft import rdt
+from sliplab.plugins.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
 from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import DeviceHealth, Mounting, RigError
 from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.core.network import BoundedSocket
-from sliplab.rigs.devices.ati_net_ft import rdt
-from sliplab.rigs.devices.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
 from sliplab.storage.streams import Json, WrenchChunk
 
 DEVICE = "force sensor"

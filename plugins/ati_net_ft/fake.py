@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from sliplab.rigs.devices.ati_net_ft import rdt
+from sliplab.plugins.ati_net_ft import rdt
 from sliplab.storage.streams import F64, WrenchChunk
 
 TURN_S = 0.0005

@@ -21,10 +21,10 @@ from pathlib import Path
 import av
 import numpy as np
 
+from sliplab.plugins.uvc.driver import UvcCamera
+from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.driver import SceneFrames
 from sliplab.rigs.core.host_clock import HostClock
-from sliplab.rigs.devices.uvc.driver import UvcCamera
-from sliplab.rigs.devices.uvc.settings import UvcSettings
 from sliplab.storage.streams import U8, FrameChunk
 
 POLL_S = 0.01
