@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sliplab.plugins.uvc import DRIVER, driver
+from sliplab.plugins.uvc import driver
 from sliplab.plugins.uvc.capture import Capture, configure
+from sliplab.plugins.uvc.device import DRIVER
 from sliplab.plugins.uvc.driver import UvcCamera
 from sliplab.plugins.uvc.fake import VideoPipe
 from sliplab.plugins.uvc.settings import UvcSettings
