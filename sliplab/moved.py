@@ -22,6 +22,8 @@ MOVED = {
     "sliplab.rigs.mock.fault_kinds": "sliplab.rigs.core.faults",
     "sliplab.rigs.devices.uvc": "sliplab.plugins.uvc",
     "sliplab.rigs.devices.ati_net_ft": "sliplab.plugins.ati_net_ft",
+    "sliplab.analysis.evaluation.classes": "sliplab.plugins.classes.evaluation",
+    "sliplab.storage.schema.classes": "sliplab.plugins.classes.document",
     "sliplab.rigs.devices.settings": "sliplab.rigs.device_section",
     "sliplab.rigs.levels": "sliplab.rigs.mock.levels",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",

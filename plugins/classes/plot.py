@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sliplab.analysis.report.figures.style import BLUE, GREY, STYLE, WIDTH, Array, svg_text
-from sliplab.storage.schema.classes import LengthShare
+from sliplab.plugins.classes.document import LengthShare
 
 WRITTEN = 12
 """Classes up to which numbers are written into the cells."""

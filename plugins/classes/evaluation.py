@@ -30,7 +30,7 @@ from sliplab.analysis.networks.models import ModelOnDisk, choose_model
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import CLASS_PREFIX, TrialRef, by_id
-from sliplab.storage.schema.classes import (
+from sliplab.plugins.classes.document import (
     ClassEvaluation,
     ClassScore,
     ClassScores,

@@ -25,19 +25,18 @@ from sliplab.analysis.labels.label_errors import label_errors, rules_compared
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
-from sliplab.analysis.networks import marker_net
 from sliplab.analysis.networks.baselines import fit_rate_thresholds
-from sliplab.analysis.networks.marker_net import BATCH, EPOCHS, HIDDEN, POINTS, MarkerNet
 from sliplab.analysis.networks.models import ModelOnDisk, choose_model
-from sliplab.analysis.windows import displacement
-from sliplab.analysis.windows.displacement import (
+from sliplab.analysis.windows.sample_sets import TrialRef, by_id
+from sliplab.plugins.markers import displacement, marker_net
+from sliplab.plugins.markers.displacement import (
     FRAMES,
     MarkerSamples,
     all_frames,
     load_marker_samples,
     marker_displacements,
 )
-from sliplab.analysis.windows.sample_sets import TrialRef, by_id
+from sliplab.plugins.markers.marker_net import BATCH, EPOCHS, HIDDEN, POINTS, MarkerNet
 from sliplab.protocols.detection import Detection
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.evaluation import (

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.evaluation import NAME, STEP, evaluation_of
-from sliplab.analysis.evaluation.markers import make_marker_job
 from sliplab.analysis.evaluation.windows import window_intervals
 from sliplab.analysis.labels.reviewed import StoreLabels
-from sliplab.analysis.networks import marker_net
-from sliplab.analysis.networks.marker_net import MarkerNet
 from sliplab.analysis.report.alarms import alarm_words
 from sliplab.analysis.report.latency import latency_section
 from sliplab.analysis.report.outcomes import failure_section
@@ -27,6 +25,9 @@ from sliplab.analysis.report.windows import (
     training_figure,
     where_section,
 )
+from sliplab.plugins.markers import marker_net
+from sliplab.plugins.markers.evaluation import make_marker_job
+from sliplab.plugins.markers.marker_net import MarkerNet
 from sliplab.storage.schema.evaluation import (
     Accuracy,
     Evaluation,
@@ -89,7 +90,7 @@ def with_classifier(
 class MarkerNetworkSection(Content):
     """Accuracy on windows of test trials, compared with simple methods."""
 
-    template: ClassVar[str] = "marker_network.html"
+    template: ClassVar[Path] = Path(__file__).with_name("section.html")
     classifier: MarkerClassifier
     accuracy: Accuracy
     interval: Share

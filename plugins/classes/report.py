@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected, agreeing
-from sliplab.analysis.evaluation import baselines
-from sliplab.analysis.evaluation.classes import SPLITS, class_evaluation_of
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import ModelOnDisk
 from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report import pages
 from sliplab.analysis.report.cover import Answer, Cover
-from sliplab.analysis.report.figures import classes as figures
 from sliplab.analysis.report.figures import intervals
 from sliplab.analysis.report.page import Content, Figure, Number, Table, percent
 from sliplab.analysis.report.sources import VERSION
@@ -30,18 +29,22 @@ from sliplab.analysis.report.windows import (
     training_figure,
     work_section,
 )
-from sliplab.storage.schema.classes import (
+from sliplab.plugins.classes import plot
+from sliplab.plugins.classes.baselines import class_methods
+from sliplab.plugins.classes.document import (
     ClassSeeds,
     ClassSummary,
     DataOrigin,
     JudgedClasses,
     LengthShare,
 )
+from sliplab.plugins.classes.evaluation import SPLITS, class_evaluation_of
 from sliplab.storage.schema.evaluation import Share
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store
 
+_HERE = Path(__file__).parent
 SHOWN = 40
 """Rows of long tables and figures."""
 PAIRS = 12
@@ -72,7 +75,7 @@ def class_report_key(store: Store, campaigns: list[Collected]) -> str:
     inputs = [
         evaluation.key,
         collected,
-        baselines.class_methods(campaigns, len(evaluation.scores.classes)).fresh_keys(store),
+        class_methods(campaigns, len(evaluation.scores.classes)).fresh_keys(store),
         place,
     ]
     return make_key("report, classes", VERSION, inputs, None)
@@ -89,7 +92,7 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
         StoreError: there is no evaluation of this version yet.
     """
     evaluation = class_evaluation_of(store)
-    methods = baselines.class_methods(campaigns, len(evaluation.scores.classes))
+    methods = class_methods(campaigns, len(evaluation.scores.classes))
     return ClassSummary(
         simulated=store.simulated,
         classes=JudgedClasses.model_validate(
@@ -138,7 +141,7 @@ def _origin(item: Collected) -> DataOrigin:
 def class_cover(summary: ClassSummary) -> Cover:
     """Return the first screen."""
     scores = summary.classes
-    return Cover("classes.html", _answer(summary), (), _headline(scores))
+    return Cover(_HERE / "page.html", _answer(summary), (), _headline(scores))
 
 
 def _answer(summary: ClassSummary) -> Answer:
@@ -226,7 +229,7 @@ class ClassDataSection(Content):
         missing: classes without training windows.
     """
 
-    template: ClassVar[str] = "class_data.html"
+    template: ClassVar[Path] = _HERE / "data.html"
     classes: int
     one_each: bool
     campaigns: Sequence[tuple[str, DataOrigin, Table]]
@@ -270,7 +273,7 @@ class ClassNetworkSection(Content):
         strong: stronger methods were trained.
     """
 
-    template: ClassVar[str] = "class_network.html"
+    template: ClassVar[Path] = _HERE / "network.html"
     length_ms: int
     scores: JudgedClasses
     chance: float
@@ -337,7 +340,7 @@ class ConfusionSection(Content):
         left_out: classes that the figure of recall leaves out.
     """
 
-    template: ClassVar[str] = "class_confusion.html"
+    template: ClassVar[Path] = _HERE / "confusion.html"
     confusion: Figure
     pairs: Table
     recall: Figure
@@ -364,7 +367,7 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
     line = None if strict is None else (strict, "all test windows")
     return ConfusionSection(
         Figure(
-            figures.confusion_map(matrix, scores.classes, simulated=simulated),
+            plot.confusion_map(matrix, scores.classes, simulated=simulated),
             name="confusion",
             data={
                 "true class": list(scores.classes),
@@ -408,7 +411,7 @@ def _confusion_section(summary: ClassSummary) -> ConfusionSection:
 class LengthSection(Content):
     """Accuracy where only the beginning of each window is seen."""
 
-    template: ClassVar[str] = "class_length.html"
+    template: ClassVar[Path] = _HERE / "length.html"
     figure: Figure
     early: str
 
@@ -426,7 +429,7 @@ def _length_section(summary: ClassSummary) -> LengthSection | None:
         "95 % interval, high (share)": [row.high for row in rows],
         "windows": [row.n for row in rows],
     }
-    svg = figures.accuracy_by_length(rows, chance, simulated=summary.simulated)
+    svg = plot.accuracy_by_length(rows, chance, simulated=summary.simulated)
     return LengthSection(Figure(svg, name="accuracy-by-length", data=data), _early_words(rows))
 
 
@@ -443,7 +446,7 @@ def _early_words(rows: Sequence[LengthShare]) -> str:
 class ErrorSection(Content):
     """Accuracy by condition, and recordings that were not classified rightly."""
 
-    template: ClassVar[str] = "class_where.html"
+    template: ClassVar[Path] = _HERE / "where.html"
     factors: Figure | None
     wrong: Table
     all_wrong: int
@@ -485,7 +488,7 @@ def _error_section(summary: ClassSummary) -> ErrorSection:
 class ClassMadeSection(Content):
     """Settings, versions, hashes, and the commands that make the results again."""
 
-    template: ClassVar[str] = "class_made.html"
+    template: ClassVar[Path] = _HERE / "made.html"
     folded: ClassVar[bool] = True
     seeds: ClassSeeds
     settings: Table
@@ -556,3 +559,17 @@ def class_sections(
         _made_section(store, campaigns, summary, fitted),
     ]
     return [section for section in sections if section is not None]
+
+
+def class_page(store: Store, campaigns: list[Collected], model: ModelOnDisk) -> pages.Page:
+    """Return the page about recordings of classes.
+
+    Args:
+        model: the evaluated network.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    summary = class_summary(store, campaigns)
+    sections = class_sections(store, campaigns, summary, model)
+    return pages.make_page(campaigns, summary.to_json(), class_cover(summary), sections)

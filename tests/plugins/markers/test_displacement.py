@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sliplab.analysis.windows import displacement
-from sliplab.analysis.windows.displacement import FRAMES, _held, choose_frames, cut_frames
+from sliplab.plugins.markers import displacement
+from sliplab.plugins.markers.displacement import FRAMES, _held, choose_frames, cut_frames
 
 
 def slide(frames: int = 12, markers: int = 4, seed: int = 1) -> np.ndarray:

@@ -13,7 +13,6 @@ from jsonschema import Draft7Validator
 
 from sliplab.analysis.campaigns import class_names, collected
 from sliplab.analysis.evaluation import baselines
-from sliplab.analysis.evaluation.classes import class_evaluation_of, whole_recordings
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows.dataset import SampleSet
@@ -24,9 +23,10 @@ from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.report import report
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
+from sliplab.plugins.classes.document import ClassSummary
+from sliplab.plugins.classes.evaluation import class_evaluation_of, whole_recordings
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.schema.classes import ClassSummary
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import answer, here
 from tests.docs.nonsense import check_refusals

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.windows.displacement import FRAMES, MarkerSamples
+from sliplab.plugins.markers.displacement import FRAMES, MarkerSamples
 from sliplab.storage.trials.array_file import Arrays, map_arrays, write_arrays
 
 F32 = npt.NDArray[np.float32]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from sklearn.neural_network import MLPClassifier
 
-from sliplab.analysis.networks import marker_net
 from sliplab.analysis.windows.dataset import TrialId
-from sliplab.analysis.windows.displacement import FRAMES, MarkerSamples, cut_frames
+from sliplab.plugins.markers import marker_net
+from sliplab.plugins.markers.displacement import FRAMES, MarkerSamples, cut_frames
 
 
 def samples(n: int, seed: int, markers: int = 5) -> MarkerSamples:
