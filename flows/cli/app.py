@@ -14,15 +14,14 @@ from sliplab.flows.cli import (
     detect,
     exchange,
     export,
-    page,
     register,
-    review,
     rigs,
     schema,
     status,
     steps,
     store,
     study,
+    view,
 )
 from sliplab.flows.cli.common import RESEARCH
 from sliplab.flows.running import console
@@ -64,10 +63,9 @@ for part in (
     schema.app,
     control.app,
     status.app,
-    page.app,
     rigs.app,
     steps.app,
-    review.app,
+    view.app,
     detect.app,
     study.app,
     store.app,

@@ -33,12 +33,12 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected, has_plan
+from sliplab.analysis.event_rate import RATE_NS, event_rate
 from sliplab.analysis.force import has_forces, plate_forces
 from sliplab.analysis.labels.reviewed import label_key, state_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.running import stopping
-from sliplab.flows.ui.trial_data import RATE_NS, event_rate
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import Child, start_tethered
