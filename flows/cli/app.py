@@ -21,7 +21,6 @@ from sliplab.flows.cli import (
     steps,
     store,
     study,
-    view,
 )
 from sliplab.flows.cli.common import RESEARCH
 from sliplab.flows.running import console
@@ -65,7 +64,6 @@ for part in (
     status.app,
     rigs.app,
     steps.app,
-    view.app,
     detect.app,
     study.app,
     store.app,

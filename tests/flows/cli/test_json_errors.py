@@ -181,7 +181,7 @@ def test_one_object_after_a_result_was_printed(
 
 
 def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sliplab.flows.ui import view
+    from sliplab.plugins.view import view
 
     monkeypatch.setattr(view, "find", lambda *_: None)
     monkeypatch.setattr(view, "show", lambda _: None)

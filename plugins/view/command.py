@@ -28,7 +28,7 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Show a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
-    from sliplab.flows.ui import view as looking
+    from sliplab.plugins.view import view as looking
     from sliplab.storage.remote.mirror import open_store
 
     subject = looking.find(open_store(store), trial, campaign)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.ui import view
+from sliplab.plugins.view import view
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
