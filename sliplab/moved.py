@@ -22,6 +22,7 @@ MOVED = {
     "sliplab.rigs.mock.fault_kinds": "sliplab.rigs.core.faults",
     "sliplab.flows.server": "sliplab.plugins.web.server",
     "sliplab.flows.web": "sliplab.plugins.web.pages",
+    "sliplab.rigs.loopback": "sliplab.plugins.loopback",
     "sliplab.rigs.devices.uvc": "sliplab.plugins.uvc",
     "sliplab.rigs.devices.ati_net_ft": "sliplab.plugins.ati_net_ft",
     "sliplab.analysis.evaluation.classes": "sliplab.plugins.classes.evaluation",

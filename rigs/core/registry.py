@@ -33,7 +33,6 @@ BUILT_IN = {
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
     "mock": "sliplab.rigs.mock:DRIVER",
     "devices": "sliplab.rigs.real:DRIVER",
-    "loopback": "sliplab.rigs.loopback:DRIVER",
 }
 
 

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.plugins.loopback.arm_path import FakeArmPath
+from sliplab.plugins.loopback.device import STREAMS
+from sliplab.plugins.loopback.tool_load import ToolLoad
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
@@ -35,9 +38,6 @@ from sliplab.rigs.core.faults import wired
 from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.loopback import STREAMS
-from sliplab.rigs.loopback.arm_path import FakeArmPath
-from sliplab.rigs.loopback.tool_load import ToolLoad
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.event_camera import MockEventCamera

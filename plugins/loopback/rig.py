@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 
+from sliplab.plugins.loopback.client import Loopback
 from sliplab.rigs.build import ShouldStop, driven_rig, never
+from sliplab.rigs.core.driver import BuildRig
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.loopback.client import Loopback
 from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 
@@ -26,6 +27,19 @@ def build_rig(file: RigFile, should_stop: ShouldStop) -> Rig:
         rig = loopback_rig(file, stage, should_stop, (stage.close,))
         undo.pop_all()
     return rig
+
+
+@contextmanager
+def rig_builder(file: RigFile) -> Iterator[BuildRig]:
+    """Yield what builds rigs one after the other on the same fakes.
+
+    Raises:
+        RigError: the fakes do not start.
+    """
+    assert file.devices is not None
+    stage = Loopback(scene_of(file), file.timing, file.devices, file.streams)
+    with closing(stage):
+        yield lambda rig, should_stop: loopback_rig(rig, stage, should_stop)
 
 
 def loopback_rig(

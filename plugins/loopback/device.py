@@ -1,8 +1,4 @@
-"""The loopback rig: real drivers on fakes that speak the devices' protocols and share one scene.
-
-It is for tests and rehearsals. The fakes reproduce the devices' replies and failures, not their
-timing.
-"""
+"""Declaration of the driver `loopback`; cheap to import."""
 
 from __future__ import annotations
 
@@ -63,6 +59,7 @@ DRIVER = RigDriver(
     title="real drivers on fakes",
     sections=("devices", "mock"),
     settings=DeviceSettings,
-    build=lazy("sliplab.rigs.loopback.rig:build_rig"),
+    build=lazy("sliplab.plugins.loopback.rig:build_rig"),
     faults=_faults,
+    builder=lazy("sliplab.plugins.loopback.rig:rig_builder"),
 )

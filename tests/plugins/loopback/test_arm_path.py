@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sliplab.plugins.loopback.arm_path import FakeArmPath
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
-from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.mock.path import TOOL, TrueSurface
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap

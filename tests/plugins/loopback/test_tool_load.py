@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.loopback.tool_load import ToolLoad
 from sliplab.rigs.core.capabilities import Mounting, Pose
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.devices.ur.fake import Client
 from sliplab.rigs.devices.ur.fake_program import UrProgram
-from sliplab.rigs.loopback.tool_load import ToolLoad
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.rigs.mock.settings import MockSettings

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
+from sliplab.plugins.loopback import client
+from sliplab.plugins.loopback.client import Loopback
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.library_process import PipeCalls
-from sliplab.rigs.loopback import client
-from sliplab.rigs.loopback.client import Loopback
 
 Serve = Callable[[Connection], None]
 

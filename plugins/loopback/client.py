@@ -17,6 +17,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
+from sliplab.plugins.loopback.device import STREAMS
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
@@ -25,7 +26,6 @@ from sliplab.rigs.core.driver import EventCameraDriver
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 from sliplab.rigs.core.library_process import PipeCalls
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.loopback import STREAMS
 from sliplab.rigs.mock.further_settings import FurtherEventCamera
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import RigFile
@@ -245,7 +245,7 @@ def _serve(
 ) -> None:
     """Run the process; it ends with its parent, without waiting for libraries to shut down."""
     leave_to_parent()
-    from sliplab.rigs.loopback.simulation_server import SimulationServer
+    from sliplab.plugins.loopback.simulation_server import SimulationServer
 
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes
     status, server = 1, None
