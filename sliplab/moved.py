@@ -23,6 +23,8 @@ MOVED = {
     "sliplab.flows.server": "sliplab.plugins.web.server",
     "sliplab.flows.web": "sliplab.plugins.web.pages",
     "sliplab.rigs.loopback": "sliplab.plugins.loopback",
+    "sliplab.storage.formats.adapted": "sliplab.plugins.adapters.importing",
+    "sliplab.storage.formats.adapted_trials": "sliplab.plugins.adapters.trials",
     "sliplab.rigs.devices.uvc": "sliplab.plugins.uvc",
     "sliplab.rigs.devices.ati_net_ft": "sliplab.plugins.ati_net_ft",
     "sliplab.analysis.evaluation.classes": "sliplab.plugins.classes.evaluation",

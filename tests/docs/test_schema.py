@@ -22,7 +22,7 @@ from sliplab.storage.files import json_text, read_json
 from tests.conftest import ROOT
 from tests.docs.nonsense import changed_at, check_refusals, checker, leaves, nonsense
 from tests.flows.older import older_store
-from tests.storage.formats.adapters import SLIDES
+from tests.plugins.adapters.adapters import SLIDES
 
 FILES: list[tuple[str, Path]] = [
     *(("protocol", path) for path in sorted((ROOT / "protocols").glob("*.yaml"))),

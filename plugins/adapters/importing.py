@@ -10,6 +10,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sliplab.plugins.adapters.labels import FoundTime, find_motion
+from sliplab.plugins.adapters.streams import (
+    NO_ROW,
+    FrameNotes,
+    read_events,
+    read_frames,
+    read_samples,
+)
+from sliplab.plugins.adapters.trials import (
+    EVENTS,
+    FRAME_TIMES,
+    FRAMES,
+    POSES,
+    AdaptedSet,
+    AdaptedTrial,
+)
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.adapter_parts import (
     OWN_FORMATS,
@@ -21,22 +37,6 @@ from sliplab.protocols.adapter_parts import (
 )
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY, ClockMap
-from sliplab.storage.formats.adapted_labels import FoundTime, find_motion
-from sliplab.storage.formats.adapted_streams import (
-    NO_ROW,
-    FrameNotes,
-    read_events,
-    read_frames,
-    read_samples,
-)
-from sliplab.storage.formats.adapted_trials import (
-    EVENTS,
-    FRAME_TIMES,
-    FRAMES,
-    POSES,
-    AdaptedSet,
-    AdaptedTrial,
-)
 from sliplab.storage.formats.foreign import (
     DataSpan,
     ForeignTrial,

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
+from sliplab.plugins.adapters.trials import find_trials
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
-from tests.storage.formats.adapter_streams import (
+from tests.plugins.adapters.adapter_streams import (
     BASE,
     FRAMES,
     ONSETS,
@@ -29,7 +29,7 @@ from tests.storage.formats.adapter_streams import (
     some_frames,
     write_frames,
 )
-from tests.storage.formats.adapters import bring
+from tests.plugins.adapters.adapters import bring
 
 HOUR_NS = 3_600_000_000_000
 

@@ -14,7 +14,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.recording import Recording
-from tests.storage.formats.adapters import bring
+from tests.plugins.adapters.adapters import bring
 
 EVENTS: dict[str, Any] = {"format": "csv", "columns": {"t": 0, "x": 1, "y": 2, "p": 3}}
 EVENTS |= {"unit": "us", "size_px": [8, 6]}

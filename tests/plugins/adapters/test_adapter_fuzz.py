@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.command_line import here
-from tests.storage.formats.adapters import COUNTS, SLIDES, slides, touches
+from tests.plugins.adapters.adapters import COUNTS, SLIDES, slides, touches
 
 SECRET = "what stands outside"
 HOSTILE: tuple[Any, ...] = (

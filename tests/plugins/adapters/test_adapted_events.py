@@ -14,7 +14,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.recording import Recording
-from tests.storage.formats.adapter_streams import (
+from tests.plugins.adapters.adapter_streams import (
     BASE,
     EVENTS,
     adapter,
@@ -24,7 +24,7 @@ from tests.storage.formats.adapter_streams import (
     refused,
     zipped,
 )
-from tests.storage.formats.adapters import bring
+from tests.plugins.adapters.adapters import bring
 from tests.storage.formats.files import SMALL, lab_pickles
 from tests.storage.formats.recordings import (
     SIZE,

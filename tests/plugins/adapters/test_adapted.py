@@ -15,11 +15,11 @@ import pytest
 import yaml
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.plugins.adapters.importing import import_adapted
+from sliplab.plugins.adapters.trials import find_trials
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
-from sliplab.storage.formats.adapted import import_adapted
-from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.tables import read_columns
@@ -27,9 +27,9 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
+from tests.plugins.adapters.adapters import COUNTS, SLIDES, bring, slides, touches
 from tests.protocols.planning import put_all
 from tests.protocols.planning import rows as table_of
-from tests.storage.formats.adapters import COUNTS, SLIDES, bring, slides, touches
 from tests.storage.formats.recordings import write_aedat4
 
 

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import yaml
 
+from sliplab.plugins.adapters.importing import import_adapted
+from sliplab.plugins.adapters.trials import find_trials
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.adapted import import_adapted
-from sliplab.storage.formats.adapted_trials import find_trials
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify

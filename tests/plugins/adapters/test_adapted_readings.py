@@ -18,7 +18,7 @@ from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
-from tests.storage.formats.adapters import bring
+from tests.plugins.adapters.adapters import bring
 
 TABLE = {"files": "{kind}/trial{n}.csv", "format": "csv", "unit": "s"}
 VALUES = {**TABLE, "quantity_unit": "kPa"}

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sliplab.plugins.adapters.labels import FoundLabel, find_labels
 from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.adapter_parts import BUILT_IN, OWN_FORMATS, FieldRule
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
 from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
 from sliplab.protocols.shown import plural
-from sliplab.storage.formats.adapted_labels import FoundLabel, find_labels
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
 from sliplab.storage.formats.known import format_names, known_format
