@@ -15,6 +15,7 @@ from sliplab.analysis.campaigns import class_names, collected
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.baseline_nets import TAXEL_KINDS
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_class_samples
 from sliplab.flows.evaluate import evaluate
@@ -23,6 +24,7 @@ from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.report import report
 from sliplab.flows.train import train
 from sliplab.flows.window_checks import window_baselines
+from sliplab.plugins.classes import baselines as class_baselines
 from sliplab.plugins.classes.document import ClassSummary
 from sliplab.plugins.classes.evaluation import class_evaluation_of, whole_recordings
 from sliplab.protocols.errors import InputError
@@ -153,8 +155,8 @@ def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> 
 def test_nothing_is_made_twice_and_other_methods_join(
     copied: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(baselines, "TAXEL_KINDS", {"gru": baselines.TAXEL_KINDS["gru"]})
-    monkeypatch.setattr(baselines, "CLASS_EPOCHS", 2)
+    monkeypatch.setattr(class_baselines, "TAXEL_KINDS", {"gru": TAXEL_KINDS["gru"]})
+    monkeypatch.setattr(class_baselines, "CLASS_EPOCHS", 2)
 
     def boosted(*_: object, classes: int) -> None:
         raise ValueError(f"gradient boosting needs more than {classes} classes")
@@ -300,7 +302,7 @@ def test_classes_and_slip_are_analysed_apart(copied: Store) -> None:
 
 
 def test_more_classes_than_a_byte_counts_are_told_apart_in_the_matrix() -> None:
-    from sliplab.analysis.report.figures.classes import NAMED, confusion_map
+    from sliplab.plugins.classes.plot import NAMED, confusion_map
 
     many = 130
     matrix = np.eye(many, many + 1, dtype=np.int64)
