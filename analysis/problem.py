@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from sliplab.analysis.campaigns import (
     Collected,
@@ -321,8 +321,10 @@ def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
     return SlipByEvents(labels, campaigns)
 
 
-def __getattr__(name: str) -> Any:
-    """Return what was here before; packages of other labs name it."""
-    if name == "ClassesOfRecordings":
-        return import_foreign("sliplab.plugins.classes.problem:ClassesOfRecordings")
-    raise AttributeError(f"module {__name__} has no {name}")
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Return what was here before; packages of other labs name it."""
+        if name == "ClassesOfRecordings":
+            return import_foreign("sliplab.plugins.classes.problem:ClassesOfRecordings")
+        raise AttributeError(f"module {__name__} has no {name}")

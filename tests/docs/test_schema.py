@@ -105,7 +105,7 @@ EVERY = [False, pytest.param(True, marks=pytest.mark.long)]
 def test_nothing_is_refused_in_a_document_that_its_reader_takes(
     older: Path, kind: str, pattern: str, every: bool
 ) -> None:
-    """Documents of classes are tested where a store has them (tests/flows/test_classes.py)."""
+    """Documents of classes are tested where a store has them (tests/plugins/classes)."""
     path = min(older.glob(pattern))
     assert check_refusals(kind, path, every=every) > (100 if every else 25)
 
