@@ -1,9 +1,8 @@
 """What is to be told apart in recordings, and how: one class for each kind of problem.
 
-The steps that train, evaluate and report ask `problem_of` and know `Problem` alone. There are
-three: slip by events, slip by marker displacements (of rigs without events), and recordings that
-show classes of their own. A plug-in adds another one, most simply as a `ClassesOfRecordings` with
-classes and labels of its own.
+The steps that train, evaluate and report ask `problem_of` and know `Problem` alone. Slip by events
+is here. Plug-ins add others, most simply as a `plugins.classes.problem.ClassesOfRecordings` with
+classes and labels of their own.
 """
 
 from __future__ import annotations
@@ -11,41 +10,31 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from sliplab.analysis.campaigns import (
     Collected,
-    agreeing,
-    class_names,
-    missing_stream,
-    of_classes,
     training_campaigns,
 )
 from sliplab.analysis.detectors.predictions import count_spikes, predict_trials, seed_step
-from sliplab.analysis.evaluation import baselines, evaluation, markers, networks
-from sliplab.analysis.evaluation import classes as class_scores
+from sliplab.analysis.evaluation import baselines, evaluation, networks
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.models import (
     ModelOnDisk,
     begun,
-    choose_model,
     comparison_models,
-    wanted_class_models,
     wanted_models,
 )
 from sliplab.analysis.report import pages
-from sliplab.analysis.report.classes import class_numbers, class_report_key
-from sliplab.analysis.report.one_camera import marker_numbers
 from sliplab.analysis.report.summary import evaluation_numbers
 from sliplab.analysis.trial_work import EachTrial, KeepTrials, in_order
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.displacement import MarkerSamples, load_marker_samples
-from sliplab.analysis.windows.sample_sets import load_class_samples, load_samples
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import import_foreign
@@ -55,9 +44,8 @@ from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationA
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import StoreError
 
-Job = evaluation.EvaluationJob | class_scores.ClassJob | markers.MarkerJob
+Job = Any
 """Everything that an evaluation depends on, found before anything is computed."""
-Samples = SampleSet | MarkerSamples
 Watch = Callable[[ModelOnDisk], AbstractContextManager[Any]]
 """Shows the training of a model while the block runs; `epoch` of its value takes each epoch."""
 
@@ -99,7 +87,7 @@ class Problem(ABC):
 
     @abstractmethod
     def samples(self, split: str, each: EachTrial = in_order) -> Any:
-        """Return the labelled windows (`Samples`) of a part of the split.
+        """Return the labelled windows of a part of the split.
 
         Args:
             each: makes those that are missing.
@@ -319,130 +307,6 @@ class SlipByEvents(EventProblem):
         return baselines.slip_methods()
 
 
-class ClassesOfRecordings(EventProblem):
-    """Classes that recordings show, by a spiking network on events."""
-
-    name = class_scores.NAME
-
-    def classes(self) -> tuple[str, ...]:
-        """Return the names of the classes, by the numbers that samples carry.
-
-        Raises:
-            StoreError: there are fewer than two.
-        """
-        return class_names(self.campaigns)
-
-    def used(self) -> list[Collected]:
-        """See `EventProblem`; all."""
-        return agreeing(self.campaigns)
-
-    def models(self) -> list[ModelOnDisk]:
-        """See `Problem`."""
-        return wanted_class_models(self.labels, self.campaigns, self.classes())
-
-    def samples(self, split: str, each: EachTrial = in_order) -> SampleSet:
-        """See `Problem`."""
-        return load_class_samples(self.labels, self.campaigns, split, each, self.classes())
-
-    def job(self, margin: float | None, smoothing: int | None) -> class_scores.ClassJob:
-        """See `Problem`.
-
-        Raises:
-            InputError: a rule of detection is given, which belongs to slip.
-        """
-        shown = f"sets how slip is detected, and '{self.campaigns[0].name}' shows classes"
-        for option, value in (("--margin", margin), ("--smoothing", smoothing)):
-            if value is not None:
-                raise InputError(option, "", value, f"{shown}; leave it out")
-        return class_scores.make_class_job(
-            self.labels, self.campaigns, self.classes(), self.models()
-        )
-
-    def prepare(self, job: class_scores.ClassJob, workers: Workers) -> dict[str, SampleSet]:
-        """Load the samples of every part of the split."""
-        return {split: self.samples(split, workers.each(split)) for split in class_scores.SPLITS}
-
-    def evaluate(self, job: class_scores.ClassJob, parts: Mapping[str, SampleSet]) -> None:
-        """See `Problem`."""
-        class_scores.evaluate_classes(job, parts)
-
-    def baselines(self) -> baselines.Methods:
-        """See `Problem`."""
-        return baselines.class_methods(self.campaigns, len(self.classes()))
-
-    def numbers(self) -> Json:
-        """See `Problem`."""
-        return class_numbers(self.labels.store)
-
-    def report_key(self) -> str:
-        """See `Problem`."""
-        return class_report_key(self.labels.store, self.campaigns)
-
-    def page(
-        self, planned_bytes: Callable[[Collected], int], seconds: Mapping[str, float]
-    ) -> pages.Page:
-        """See `Problem`."""
-        store = self.labels.store
-        reviewed = class_scores.class_evaluation_of(store).reviewed is not None
-        models = replace(self, labels=replace(self.labels, reviewed=reviewed)).models()
-        return pages.class_page(store, self.campaigns, choose_model(models))
-
-
-class SlipByMarkers(Problem):
-    """No slip, incipient and gross slip, by a classifier on marker displacements."""
-
-    name = evaluation.NAME
-
-    def reason_against(self, step: str) -> str | None:
-        """See `Problem`; searches and hold-outs run a spiking network."""
-        if step not in {"sync", "label", "train", "evaluate", "report"}:
-            return "works with the spiking network on events, and there are none"
-        slides = any(item.experiment == "kinematic" for item in self.campaigns)
-        if step in {"train", "evaluate"} and not slides:
-            return (
-                "the classifier is trained on slides, and without events nothing else is evaluated"
-            )
-        return None
-
-    def models(self) -> list[ModelOnDisk]:
-        """See `Problem`."""
-        return markers.wanted_marker_models(self.labels, self.campaigns)
-
-    def samples(self, split: str, each: EachTrial = in_order) -> MarkerSamples:
-        """See `Problem`; they take seconds on this machine."""
-        return load_marker_samples(self.labels, self.campaigns, split)
-
-    def train(
-        self, model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples, watch: Watch
-    ) -> list[str]:
-        """See `Problem`."""
-        net = markers.train_marker_model(model, train, validation)
-        strict = model.info.validation.strict
-        shown = "" if strict is None else f", validation {100 * strict:.1f} %"
-        return [f"{model.title}: {net.title}; epoch {net.chosen_epoch}{shown}"]
-
-    def job(self, margin: float | None, smoothing: int | None) -> markers.MarkerJob:
-        """See `Problem`."""
-        return markers.make_marker_job(self.labels, self.campaigns, margin, smoothing)
-
-    def prepare(self, job: markers.MarkerJob, workers: Workers) -> dict[str, Any]:
-        """See `Problem`; nothing is needed."""
-        return {}
-
-    def evaluate(self, job: markers.MarkerJob, parts: Mapping[str, Any]) -> None:
-        """See `Problem`."""
-        markers.evaluate_markers(job)
-
-    def numbers(self) -> Json:
-        """See `Problem`."""
-        return marker_numbers(self.labels.store, self.campaigns)
-
-    def baselines(self) -> baselines.Methods:
-        """See `Problem`."""
-        training_campaigns(self.campaigns)  # raises
-        return baselines.slip_methods()
-
-
 def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
     """Return the problem that campaigns pose: one of a plug-in, where it takes them, or ours.
 
@@ -450,10 +314,17 @@ def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
         InputError: some show classes and some show slip.
         PluginError: one of a plug-in cannot be imported.
     """
-    for place in plugins().declared("problems").values():
+    # those that ship come last, so that a package can take what they would
+    for place in reversed(plugins().declared("problems").values()):
         if (found := import_foreign(place)(labels, campaigns)) is not None:
             return cast("Problem", found)
-    if of_classes(campaigns):
-        return ClassesOfRecordings(labels, campaigns)
-    kind = SlipByMarkers if missing_stream(campaigns) == "events" else SlipByEvents
-    return kind(labels, campaigns)
+    return SlipByEvents(labels, campaigns)
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Return what was here before; packages of other labs name it."""
+        if name == "ClassesOfRecordings":
+            return import_foreign("sliplab.plugins.classes.problem:ClassesOfRecordings")
+        raise AttributeError(f"module {__name__} has no {name}")

@@ -142,9 +142,9 @@ def run(what: str, form: str, folder: Path) -> None:
         recordings = list(store.campaign("large").recordings())
         export_trials(recordings, folder / "out", form, "large")
     elif form in ADAPTED:
+        from sliplab.plugins.adapters.importing import import_adapted
+        from sliplab.plugins.adapters.trials import find_trials
         from sliplab.protocols.adapter import load_adapter
-        from sliplab.storage.formats.adapted import import_adapted
-        from sliplab.storage.formats.adapted_trials import find_trials
         from sliplab.storage.formats.data_folder import DataFolder
 
         file = folder / "adapter.yaml"

@@ -53,7 +53,7 @@ PROGRAMS = {
     "sliplab page": "page",
     "sliplab alerts": "alerts",
     "embedded_server": "prefect",
-    "flows.server.runs": "run",
+    "web.server.runs": "run",
 }
 PAUSED_S = 90.0
 _TICK = os.sysconf("SC_CLK_TCK")

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from sliplab.flows.collecting.requests import store_lock
 from sliplab.flows.running import console
-from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import plugins
 from sliplab.protocols.shown import one_of
-from sliplab.protocols.yaml_file import read_text
 from sliplab.storage.files import safe_name
-from sliplab.storage.formats.adapted import import_adapted
-from sliplab.storage.formats.adapted_trials import AdaptedSet, find_trials
-from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import format_names
 from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
@@ -61,7 +56,8 @@ def import_data(
         for option, given in (("KIND", kind is not None), ("--simulated", simulated)):
             if given:
                 raise InputError(option, "", None, "cannot be given with --adapter")
-        return _by_adapter(adapter, path, store, name, dry_run, salvage)
+        made: Json = plugins().hook("import_adapted")(adapter, path, store, name, dry_run, salvage)
+        return made
     if dry_run:
         raise InputError("--dry-run", "", None, "is for an import with --adapter")
     if name is None:
@@ -69,16 +65,16 @@ def import_data(
     if kind is not None and kind not in format_names():
         raise InputError("KIND", "", kind, one_of(kind, format_names()))
     found_kind = kind_of(path) if kind is None else kind
-    _check_name(name)
+    check_name(name)
     skipped = skipped_in(path, found_kind)
     found = trials_in(path, found_kind, salvage=salvage)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
-    with _new_store(store) as opened, store_lock(opened):
+    with new_store(store) as opened, store_lock(opened):
         result = import_trials(
             opened, name, found, path, found_kind, lambda it: console.say(it), salvage=salvage
         )
-    _say_faults(result)
+    say_faults(result)
     for item in skipped:
         console.say(f"skipped: {item.file}: {item.reason}")
     if skipped:
@@ -86,64 +82,15 @@ def import_data(
     return result
 
 
-def _by_adapter(
-    file: Path, path: Path, place: Path, name: str | None, dry_run: bool, salvage: bool
-) -> Json:
-    text = read_text(file, "adapter")
-    adapter = load_adapter(file)
-    name = adapter.name if name is None else name
-    _check_name(name)
-    with closing(DataFolder(path)) as folder:
-        found = find_trials(adapter, file, folder)
-        parts = found.parts()
-        for warning in found.warnings:
-            console.say(f"warning: {warning}")
-        warnings = list(found.warnings)
-        if dry_run:
-            result: Json = {"campaign": name, "trials": _planned(found, parts, place, name)}
-        else:
-            bar = console.bar("import (trials)", len(found.trials))
-            with _new_store(place) as store, store_lock(store), bar as progress:
-                result = import_adapted(
-                    store,
-                    name,
-                    found,
-                    text,
-                    lambda trial: progress.advance(1, trial),
-                    salvage=salvage,
-                )
-            _say_faults(result)
-            warnings += result.get("warnings", ())
-        return result | {
-            "split": dict(Counter(parts.values())),
-            "warnings": warnings,
-            "skipped": [vars(item) for item in found.skipped],
-        }
-
-
-def _planned(found: AdaptedSet, parts: dict[str, str], place: Path, name: str) -> list[Json]:
-    """Return what would be imported, a row a trial."""
-    existing = Store.open(place).campaign(name).committed() if Store.exists(place) else set()
-    return [
-        {
-            "trial": trial.id,
-            "condition": trial.condition,
-            "label": None if trial.label is None else str(trial.label),
-            "part": parts[trial.id],
-            "there": trial.id in existing,
-        }
-        for trial in found.trials
-    ]
-
-
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Raise InputError if no campaign can have this name."""
     try:
         safe_name(name)
     except StoreError as error:
         raise InputError("--name", "", name, str(error)) from None
 
 
-def _say_faults(result: Json) -> None:
+def say_faults(result: Json) -> None:
     """Print the warnings of an import, and the trials that could not be imported."""
     for text in result.get("warnings", ()):
         console.say(f"warning: {text}")
@@ -152,7 +99,7 @@ def _say_faults(result: Json) -> None:
 
 
 @contextmanager
-def _new_store(place: Path) -> Iterator[Store]:
+def new_store(place: Path) -> Iterator[Store]:
     """Yield the store at `place`; one that is made here is removed again if it stays empty."""
     there = place.is_dir() and any(place.iterdir())
     existed = place.exists()

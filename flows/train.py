@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from prefect import flow, task
@@ -16,7 +16,7 @@ from prefect.cache_policies import NO_CACHE
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks.models import ModelOnDisk
-from sliplab.analysis.problem import Problem, Samples, problem_of
+from sliplab.analysis.problem import Problem, problem_of
 from sliplab.analysis.trial_work import Done, EachTrial, Make, TrialWork, in_order
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Opaque[tuple[Problem, ModelOnDisk, Samples, Samples, bool]]) -> int:
+def train_one(job: Opaque[tuple[Problem, ModelOnDisk, Any, Any, bool]]) -> int:
     """Train and store one network."""
     problem, model, train, validation, simulated = job.content
     for line in problem.train(
@@ -93,7 +93,7 @@ def train(
     }
 
 
-def _warn_of_missing(classes: tuple[str, ...], train: Samples) -> None:
+def _warn_of_missing(classes: tuple[str, ...], train: Any) -> None:
     """Warn of classes that a network cannot learn."""
     there = set(np.unique(train.y).tolist())
     missing = [name for number, name in enumerate(classes) if number not in there]

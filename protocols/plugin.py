@@ -35,7 +35,8 @@ class Plugin:
         studies: by name, studies (`analysis.study.Study`): each is a command with a result and a
             page. One of a group, such as ``calibrate``, has the name ``GROUP NAME``.
         documents: by kind, further models of the JSON documents that it writes
-            (`storage.schema.document.Document`), each with the title of its schema.
+            (`storage.schema.document.Document`), each with the title of its schema. One of a kind
+            ``NAME-summary`` is a report's summary, which other reports are compared with.
         detectors: detectors of slip (`analysis.detectors.detector.Detector`), by name: classes or
             functions without arguments.
         drivers: drivers of devices (`rigs.core.driver.Driver`), by name. A package that has only

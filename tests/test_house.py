@@ -23,7 +23,7 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
         "storage/trials/recording.py",
         "storage/schema/trial.py",
         "analysis/labels/label_errors.py",
-        "flows/ui/view.py",  # drawn beside the label, and called simulated
+        "plugins/view/view.py",  # drawn beside the label, and called simulated
     }
     assert named_in("true_onset_ns") == {
         "analysis/labels/label_errors.py",

@@ -13,21 +13,17 @@ from typing import Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected, agreeing
 from sliplab.analysis.evaluation import windows as window_scores
-from sliplab.analysis.evaluation.classes import NAME as CLASSES
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.baseline_nets import (
     BATCH,
     EPOCHS,
     KINDS,
-    TAXEL_KINDS,
     fitted_net,
     net_votes,
 )
 from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.sample_sets import CLASS_PREFIX
 from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
 from sliplab.storage.schema.evaluation import BaselineResult, TrainedBaseline
 from sliplab.storage.trials.derived import Derived, make_key
@@ -45,8 +41,6 @@ NAMES: dict[str, Any] = {
     **{kind: [EPOCHS, *SEEDS] for kind in KINDS},
 }
 """Each baseline on windows of slip, and what else it depends on."""
-CLASS_EPOCHS, CLASS_BATCH = 40, 16
-"""Of ordinary networks on recordings of classes, which are some hundreds of windows."""
 
 
 @dataclass(frozen=True)
@@ -106,15 +100,6 @@ class Methods:
 def slip_methods() -> Methods:
     """Return the methods on windows of slip."""
     return Methods(NAMES)
-
-
-def class_methods(campaigns: list[Collected], classes: int) -> Methods:
-    """Return the methods on windows of recordings of classes; of taxels there is no frame."""
-    windows = agreeing(campaigns)[0].settings.windows
-    kinds = KINDS if windows.taxels is None else TAXEL_KINDS
-    nets = {kind: [CLASS_EPOCHS, CLASS_BATCH, *SEEDS] for kind in kinds}
-    names = {"boosting": [ROUNDS, classes], **nets}
-    return Methods(names, classes, CLASS_PREFIX, CLASSES, CLASS_EPOCHS, CLASS_BATCH)
 
 
 def train_baseline(

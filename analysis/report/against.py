@@ -29,7 +29,8 @@ from sliplab.analysis.report.figures.intervals import differences
 from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.analysis.report.scores import Row, score_rows
 from sliplab.protocols.errors import InputError
-from sliplab.storage.schema.classes import ClassSummary
+from sliplab.protocols.plugin import plugins
+from sliplab.protocols.plugins import import_foreign
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
@@ -177,7 +178,9 @@ def load_report(place: Path, option: str = "--against") -> Document:
     path = place.joinpath(*SUMMARY) if place.is_dir() else place
     right = "must be a store with a report, or its report/summary.json"
     why = ""
-    for kind in (Summary, OneCameraSummary, ClassSummary):
+    others = plugins().declared("documents").items()
+    found = [import_foreign(each) for name, (each, _) in others if name.endswith("-summary")]
+    for kind in (Summary, OneCameraSummary, *found):
         try:
             return kind.load(path)
         except OSError as error:

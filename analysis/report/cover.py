@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.latency import EXPERIMENTS, draw_times
@@ -45,7 +46,7 @@ class Cover:
         headline: numbers below it.
     """
 
-    template: str
+    template: str | Path
     answer: Answer
     notices: Sequence[str]
     headline: Sequence[Number]

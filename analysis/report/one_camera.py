@@ -18,17 +18,11 @@ from sliplab.analysis.report.campaign import collected_section, quality_section,
 from sliplab.analysis.report.cover import Cover, quality_notices, slip_answer
 from sliplab.analysis.report.figures.campaign import rates_over_motion
 from sliplab.analysis.report.labels import label_section
-from sliplab.analysis.report.marker_network import (
-    EvaluatedClassifier,
-    marker_sections,
-    read_judged,
-    with_classifier,
-)
 from sliplab.analysis.report.page import Content, Figure, Number, Rendered, Table, number
 from sliplab.analysis.report.plugin_sections import ReportData, plugin_sections, sections_key
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.analysis.report.skins import skin_section
-from sliplab.analysis.report.sources import VERSION, report_key
+from sliplab.analysis.report.sources import VERSION
 from sliplab.analysis.report.summary import (
     label_sources,
     package_versions,
@@ -41,7 +35,6 @@ from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import LabelSummary, MotionRate, OneCameraSummary, StepLeftOut
-from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -70,8 +63,13 @@ def has_labels(store: Store, campaigns: Sequence[Collected]) -> bool:
     return all(labels.fresh(item, trial) for item in campaigns for _, trial in item.trials)
 
 
-def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
+def one_camera_key(
+    store: Store, campaigns: list[Collected], evaluations: Sequence[str] = ()
+) -> str:
     """Return the key of all inputs of the report.
+
+    Args:
+        evaluations: keys of those that it shows.
 
     Raises:
         StoreError: there are frames, and a trial has no label yet.
@@ -85,11 +83,7 @@ def one_camera_key(store: Store, campaigns: list[Collected]) -> str:
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             label = labels.key(item, recording) if labelled else None
             inputs.append([item.name, trial.id, recording.checksum, label])
-    judged = read_judged(store, campaigns) if frames else None
-    if judged is not None:
-        inputs.append([judged.evaluation.key])
-    if is_evaluated(store, campaigns):
-        inputs.append([report_key(store, campaigns)])
+    inputs += [[key] for key in evaluations]
     plans = [
         [item.title, item.question, item.planned.collection_hash, len(item.campaign.quarantined())]
         for item in campaigns
@@ -102,17 +96,18 @@ def one_camera_summary(
     store: Store,
     campaigns: list[Collected],
     planned_bytes: Mapping[str, int],
-    judged: EvaluatedClassifier | None = None,
+    *,
+    evaluated: bool,
 ) -> OneCameraSummary:
     """Make the summary.
 
     Args:
         planned_bytes: of the committed trials, by campaign.
-        judged: the classifier on marker displacements.
+        evaluated: a network was trained and evaluated.
     """
     frames = missing_stream(campaigns) == "events"
     labels, rates = None, None
-    labelled, evaluated = frames or has_labels(store, campaigns), is_evaluated(store, campaigns)
+    labelled = frames or has_labels(store, campaigns)
     if labelled:
         labels = LabelSummary(
             error_ms=label_errors.label_errors(store, campaigns),
@@ -122,13 +117,13 @@ def one_camera_summary(
         )
     if not frames:
         rates = {item.name: _rate(item) for item in campaigns}
-    summary = OneCameraSummary(
+    return OneCameraSummary(
         simulated=store.simulated,
         one_camera="frames" if frames else "events",
         left_out=tuple(
             StepLeftOut(name=name, reason=reason)
             for name in ("label", "train", "evaluate")
-            if (reason := _not_done(name, judged is not None or evaluated, labelled)) is not None
+            if (reason := _not_done(name, evaluated, labelled)) is not None
         ),
         labels=labels,
         event_rates=rates,
@@ -140,19 +135,6 @@ def one_camera_summary(
         versions=package_versions(),
         protocols=protocol_hashes(campaigns),
     )
-    return summary if judged is None else with_classifier(summary, store, campaigns, judged)
-
-
-def marker_numbers(store: Store, campaigns: list[Collected]) -> Json:
-    """Return the numbers of the evaluation by markers, under the report's keys, without a report.
-
-    Raises:
-        StoreError: there is no evaluation of this version yet.
-    """
-    nothing = {item.name: 0 for item in campaigns}
-    numbers = one_camera_summary(store, campaigns, nothing, read_judged(store, campaigns)).to_json()
-    del numbers["planned"]  # that of a report alone
-    return numbers
 
 
 def _not_done(step: str, evaluated: bool, labelled: bool) -> str | None:
@@ -260,14 +242,17 @@ def one_camera_sections(
     store: Store,
     campaigns: list[Collected],
     summary: OneCameraSummary,
-    judged: EvaluatedClassifier | None = None,
+    own: Sequence[Content] = (),
 ) -> list[Content | Rendered]:
-    """Make all sections, in order."""
+    """Make all sections, in order.
+
+    Args:
+        own: those about what was evaluated.
+    """
     simulated = summary.simulated
-    sections: list[Content | Rendered | None] = [left_out_section(summary)]
-    if judged is not None:
-        sections += marker_sections(store, campaigns, summary, judged)
-    sections += [
+    sections: list[Content | Rendered | None] = [
+        left_out_section(summary),
+        *own,
         collected_section(campaigns, summary),
         registration_section(store, campaigns),
         *plugin_sections(ReportData(store, campaigns, simulated, summary)),

@@ -1,4 +1,4 @@
-"""The report's page as a whole: about slip, with both cameras or one, and about classes."""
+"""The report's page as a whole, about slip with both cameras or one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sliplab.analysis.campaigns import Collected, missing_stream
-from sliplab.analysis.networks.models import ModelOnDisk
-from sliplab.analysis.report import classes, one_camera, report
+from sliplab.analysis.report import one_camera, report
 from sliplab.analysis.report.cover import Cover
-from sliplab.analysis.report.marker_network import read_judged
 from sliplab.analysis.report.page import Content, Figure, Rendered
 from sliplab.analysis.report.sources import read_sources, report_key
 from sliplab.analysis.report.summary import make_summary
@@ -33,29 +31,17 @@ class Page:
     simulated: bool
 
 
-def class_page(store: Store, campaigns: list[Collected], model: ModelOnDisk) -> Page:
-    """Return the page about recordings of classes.
-
-    Args:
-        model: the evaluated network.
-
-    Raises:
-        StoreError: there is no evaluation of this version yet.
-    """
-    summary = classes.class_summary(store, campaigns)
-    sections = classes.class_sections(store, campaigns, summary, model)
-    return _page(campaigns, summary.to_json(), classes.class_cover(summary), sections)
-
-
 def slip_report_key(store: Store, campaigns: list[Collected]) -> str:
     """Return the key of all inputs of the page about slip.
 
     Raises:
         StoreError: there is no evaluation of this version, or a label is missing.
     """
-    if missing_stream(campaigns) is not None:
-        return one_camera.one_camera_key(store, campaigns)
-    return report_key(store, campaigns)
+    if missing_stream(campaigns) is None:
+        return report_key(store, campaigns)
+    evaluated = one_camera.is_evaluated(store, campaigns)
+    shown = (report_key(store, campaigns),) if evaluated else ()
+    return one_camera.one_camera_key(store, campaigns, shown)
 
 
 def slip_page(
@@ -71,15 +57,14 @@ def slip_page(
         seconds: that steps took.
     """
     planned = {item.name: planned_bytes(item) for item in campaigns}
-    missing = missing_stream(campaigns)
-    if missing is None:
+    if missing_stream(campaigns) is None:
         return _evaluated(store, campaigns, planned, seconds)
-    judged = read_judged(store, campaigns) if missing == "events" else None
-    shown = one_camera.one_camera_summary(store, campaigns, planned, judged)
-    if one_camera.is_evaluated(store, campaigns):
+    evaluated = one_camera.is_evaluated(store, campaigns)
+    shown = one_camera.one_camera_summary(store, campaigns, planned, evaluated=evaluated)
+    if evaluated:
         return _evaluated(store, campaigns, planned, seconds, shown)
-    sections = one_camera.one_camera_sections(store, campaigns, shown, judged)
-    return _page(campaigns, shown.to_json(), one_camera.one_camera_cover(shown), sections)
+    sections = one_camera.one_camera_sections(store, campaigns, shown)
+    return make_page(campaigns, shown.to_json(), one_camera.one_camera_cover(shown), sections)
 
 
 def _evaluated(
@@ -103,16 +88,20 @@ def _evaluated(
         sections = [one_camera.left_out_section(without_frames), *sections]
         sections += [] if rates is None else [rates]
         numbers = without_frames.to_json() | numbers
-    return _page(campaigns, numbers, report.report_cover(summary), sections)
+    return make_page(campaigns, numbers, report.report_cover(summary), sections)
 
 
-def _page(
+def make_page(
     campaigns: Sequence[Collected],
     numbers: Json,
     cover: Cover,
     sections: Sequence[Content | Rendered],
 ) -> Page:
-    """Render the page."""
+    """Render a page.
+
+    Args:
+        numbers: of the summary; `simulated` is one.
+    """
     simulated = bool(numbers["simulated"])
     html = cover.render(campaigns, sections, simulated=simulated)
     figures = [figure for section in sections for figure in section.all_figures()]

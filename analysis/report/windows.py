@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import pandas as pd
@@ -18,7 +18,6 @@ from sliplab.analysis.report.figures import windows as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.protocols.quantity import level_order
-from sliplab.storage.schema.classes import JudgedClasses
 from sliplab.storage.schema.evaluation import (
     Accuracy,
     Baseline,
@@ -331,7 +330,20 @@ class WorkSection(Content):
     others: Table
 
 
-def work_section(scores: Kinematic | JudgedClasses) -> WorkSection | None:
+class JudgedWindows(Protocol):
+    """A network's test windows: its work, and other methods on them."""
+
+    @property
+    def work(self) -> WindowWork | None: ...
+    @property
+    def seeds(self) -> Seeds: ...
+    @property
+    def beside(self) -> dict[str, Baseline]: ...
+    @property
+    def trained_baselines(self) -> dict[str, TrainedBaseline]: ...
+
+
+def work_section(scores: JudgedWindows) -> WorkSection | None:
     """Compare computation and accuracy; None where the work was not counted."""
     work = scores.work
     if work is None:
@@ -354,7 +366,7 @@ def work_section(scores: Kinematic | JudgedClasses) -> WorkSection | None:
     )
 
 
-def _rival(scores: Kinematic | JudgedClasses) -> BestBaseline | None:
+def _rival(scores: JudgedWindows) -> BestBaseline | None:
     """Find the best other method, where stronger ones were trained."""
     every: dict[str, Baseline] = {**scores.beside, **scores.trained_baselines}
     known = {name: row for name, row in every.items() if row.argmax is not None}

@@ -27,7 +27,6 @@ from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.units import load_packages
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
-from sliplab.storage.schema.classes import ClassEvaluation, ClassSummary
 from sliplab.storage.schema.detector import DetectorCalibration
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.evaluation import Evaluation
@@ -48,11 +47,6 @@ DOCUMENTS: dict[str, tuple[type[Document], str]] = {
     "evaluation": (Evaluation, "An evaluation of SlipLab"),
     "summary": (Summary, "The summary of a report of SlipLab"),
     "detector": (DetectorCalibration, "The calibration of a detector of SlipLab"),
-    "classes": (ClassEvaluation, "An evaluation of SlipLab on recordings of classes"),
-    "classes-summary": (
-        ClassSummary,
-        "The summary of a report of SlipLab on recordings of classes",
-    ),
 }
 """Documents of a store, with the titles of their schemas; plug-ins have further ones."""
 _DIALECT = "http://json-schema.org/draft-07/schema#"

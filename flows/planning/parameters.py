@@ -1,7 +1,7 @@
 """Parameters that a command, a deployment and a schedule have in common, each with its help.
 
 A command has an option for each field (`flows.cli.model_options`); deployments and schedules add
-what only they have (`flows.server.schedules`).
+what only they have (`plugins.web.server.schedules`).
 """
 
 from __future__ import annotations

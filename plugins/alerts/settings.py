@@ -17,7 +17,7 @@ from zoneinfo import ZoneInfo
 
 from pydantic import AfterValidator, Field
 
-from sliplab.flows.server.schedules import From, Zone
+from sliplab.flows.planning.clock_times import From, Zone
 from sliplab.protocols import InputError
 from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import StrictModel, parse_leniently, read_text, validate

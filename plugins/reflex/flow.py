@@ -9,8 +9,8 @@ safe state.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -31,9 +31,9 @@ from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import PlateCourse, Truth
+from sliplab.rigs.core.driver import RigDriver
+from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.loopback.rig import loopback_rig
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file, rig_hash
 from sliplab.storage.streams import EventChunk, Json
 
@@ -191,20 +191,10 @@ def measure_reflexes(asked: Request) -> ReflexStudy:
     return ReflexStudy.model_validate({**head, "rows": rows, "trials": trials})
 
 
-@contextmanager
-def _builder(file: RigFile) -> Iterator[BuildRig]:
-    """Yield a function that builds the rig of a trial; a loopback rig's fakes run for all."""
-    if file.in_virtual_time:
-        yield build_rig
-        return
-    from sliplab.rigs.loopback.client import Loopback
-
-    assert file.devices is not None
-    stage = Loopback(scene_of(file), file.timing, file.devices, file.streams)
-    try:
-        yield lambda rig, should_stop: loopback_rig(rig, stage, should_stop)
-    finally:
-        stage.close()
+def _builder(file: RigFile) -> AbstractContextManager[BuildRig]:
+    """Return what builds the rig of a trial; a loopback rig's fakes run for all."""
+    builder = find_driver(file.driver, RigDriver).builder
+    return nullcontext(build_rig) if builder is None else builder(file)
 
 
 @dataclass

@@ -9,9 +9,10 @@ library is loaded when a device is built, not when a rig file is read.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeAlias, TypeVar
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 from sliplab.rigs.core.device_settings import DriverSettings, GripperSettings
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 SettingsT = TypeVar("SettingsT", bound=DriverSettings)
 ArmSettingsT = TypeVar("ArmSettingsT", bound=BaseArmSettings)
 GripperSettingsT = TypeVar("GripperSettingsT", bound=GripperSettings)
+BuildRig: TypeAlias = "Callable[[Any, Callable[[], bool]], Rig]"
+"""Builds the rig of a `rigs.rig_file.RigFile`; the other argument says whether to stop."""
 
 
 def _no_locks(settings: Any) -> dict[str, str]:
@@ -80,11 +83,14 @@ class RigDriver(Declaration):
     """Sections that its rig files have: `devices`, `mock`; the first one has what is driven."""
     settings: type[RigSection] = field(kw_only=True)
     """Model of its first section."""
-    build: Callable[[Any, Callable[[], bool]], Rig] = field(kw_only=True)
+    build: BuildRig = field(kw_only=True)
     """Build the rig of a `rigs.rig_file.RigFile`, its arm not connected yet; the other argument
     returns whether a stop was requested. Raises RigError."""
     faults: Callable[[Any], Iterable[KeyedError]] = lambda rig: ()
     """Return what else is wrong with such a file."""
+    builder: Callable[[Any], AbstractContextManager[BuildRig]] | None = None
+    """Return what builds the rigs of one trial after the other for such a file, where they share
+    what takes long to start; it ends with the block."""
     streams: Mapping[str, type[SimulatedStream]] = field(default_factory=dict)
     """Models of simulated further devices, by the kinds of their streams."""
 

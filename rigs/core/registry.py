@@ -29,13 +29,10 @@ BUILT_IN = {
     "abb": "sliplab.rigs.devices.abb:DRIVER",
     "dvxplorer": "sliplab.rigs.devices.dvxplorer:DRIVER",
     "basler": "sliplab.rigs.devices.basler:DRIVER",
-    "uvc": "sliplab.rigs.devices.uvc:DRIVER",
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
-    "ati_net_ft": "sliplab.rigs.devices.ati_net_ft:DRIVER",
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
     "mock": "sliplab.rigs.mock:DRIVER",
     "devices": "sliplab.rigs.real:DRIVER",
-    "loopback": "sliplab.rigs.loopback:DRIVER",
 }
 
 

@@ -22,7 +22,7 @@ from sliplab.storage.files import json_text, read_json
 from tests.conftest import ROOT
 from tests.docs.nonsense import changed_at, check_refusals, checker, leaves, nonsense
 from tests.flows.older import older_store
-from tests.storage.formats.adapters import SLIDES
+from tests.plugins.adapters.adapters import SLIDES
 
 FILES: list[tuple[str, Path]] = [
     *(("protocol", path) for path in sorted((ROOT / "protocols").glob("*.yaml"))),
@@ -106,7 +106,7 @@ EVERY = [False, pytest.param(True, marks=pytest.mark.long)]
 def test_nothing_is_refused_in_a_document_that_its_reader_takes(
     older: Path, kind: str, pattern: str, every: bool
 ) -> None:
-    """Documents of classes are tested where a store has them (tests/flows/test_classes.py)."""
+    """Documents of classes are tested where a store has them (tests/plugins/classes)."""
     path = min(older.glob(pattern))
     assert check_refusals(kind, path, every=every) > (100 if every else 25)
 

@@ -17,8 +17,8 @@ from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, tria
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.examples.conftest import EXAMPLES, install
-from tests.storage.formats.adapter_streams import BASE
-from tests.storage.formats.adapters import bring
+from tests.plugins.adapters.adapter_streams import BASE
+from tests.plugins.adapters.adapters import bring
 from tests.storage.formats.recordings import COUNT, write_aedat4
 
 

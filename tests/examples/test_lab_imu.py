@@ -13,7 +13,7 @@ import pytest
 from sliplab.flows.api import open_store
 from sliplab.flows.exports import ExportRequest, check_export
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.ui import view
+from sliplab.plugins.view import view
 from sliplab.protocols import InputError
 from sliplab.protocols.timing import Delay, StreamTiming
 from sliplab.rigs.core.device_stream import DeviceStream

@@ -13,7 +13,6 @@ import pytest
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.detectors.registry import known, make_detector
-from sliplab.analysis.evaluation.classes import class_evaluation_of
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.problem import Workers, problem_of
@@ -24,6 +23,7 @@ from sliplab.flows.cli import app as cli
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome, searches
+from sliplab.plugins.classes.evaluation import class_evaluation_of
 from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store

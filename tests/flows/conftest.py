@@ -48,7 +48,7 @@ class NoServer:
     """In place of the embedded server: flows run as they do when it is lost, and say nothing.
 
     A server costs a worker of the tests minutes of a processor. What it is told is tested by those
-    in `tests/flows/running` and `tests/flows/server`, and by whole programs.
+    in `tests/flows/running` and `tests/plugins/web/server`, and by whole programs.
     """
 
     alive = answers = True

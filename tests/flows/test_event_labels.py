@@ -16,8 +16,8 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.ui.trial_data import load_trial
-from sliplab.flows.web.trial_curves import frame_html
+from sliplab.plugins.web.pages.trial_curves import frame_html
+from sliplab.plugins.web.trial_data import load_trial
 from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import KINDS, TrialLabel
 from sliplab.storage.streams import EventChunk

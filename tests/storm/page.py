@@ -19,8 +19,8 @@ from prefect.client.schemas.responses import SetStateStatus
 from prefect.states import Cancelled, Cancelling, Completed, Running, Scheduled
 
 from sliplab.flows.running import run_records
-from sliplab.flows.server import runs, schedules
-from sliplab.flows.server.runs import ServedRuns
+from sliplab.plugins.web.server import runs, schedules
+from sliplab.plugins.web.server.runs import ServedRuns
 from tests.storm.virtual import Notes
 
 POLL_S = 1.0

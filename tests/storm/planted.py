@@ -16,9 +16,9 @@ from sliplab.analysis import quality, references
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows import status
 from sliplab.flows.collecting import requests, session, supervisor, watches
-from sliplab.flows.server import runs
 from sliplab.plugins.alerts import outbox
 from sliplab.plugins.record import recorder
+from sliplab.plugins.web.server import runs
 from sliplab.rigs.core import force_watch, guard, motion_watch, rig
 from sliplab.rigs.core.capabilities import ArmState
 from sliplab.storage import files

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels.reviewed import StoreLabels
-from sliplab.analysis.problem import ClassesOfRecordings
+from sliplab.plugins.classes.problem import ClassesOfRecordings
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.recording import Recording
 

@@ -168,7 +168,7 @@ def test_one_object_after_a_result_was_printed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Review prints its address first; what ends it later must not be a second object."""
-    from sliplab.flows.web import serving
+    from sliplab.plugins.web.pages import serving
 
     def serve(*_: object) -> None:
         raise KeyboardInterrupt
@@ -181,7 +181,7 @@ def test_one_object_after_a_result_was_printed(
 
 
 def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sliplab.flows.ui import view
+    from sliplab.plugins.view import view
 
     monkeypatch.setattr(view, "find", lambda *_: None)
     monkeypatch.setattr(view, "show", lambda _: None)

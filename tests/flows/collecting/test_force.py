@@ -21,7 +21,7 @@ from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.ui import view
+from sliplab.plugins.view import view
 from sliplab.protocols import InputError, Protocol, make_plan
 from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.yaml_file import parse_yaml, validate
@@ -41,7 +41,7 @@ from tests.conftest import ROOT
 from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import session, short, take_all
 from tests.flows.conftest import tiny, tiny_gravity
-from tests.flows.ui.test_view import Read
+from tests.plugins.view.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
 TRACKS = {"level": "tracks"}

@@ -20,7 +20,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.run_request import describe_campaign, make_request
-from sliplab.flows.ui import view
+from sliplab.plugins.view import view
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
@@ -41,7 +41,7 @@ from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import checksums, short, take_all
 from tests.flows.collecting.test_session import session as plain_session
 from tests.flows.conftest import write
-from tests.flows.ui.test_view import Read
+from tests.plugins.view.test_view import Read
 
 TRACKS = {"level": "tracks"}
 SIDE = {

@@ -8,10 +8,10 @@ import pytest
 
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
+from sliplab.plugins.loopback.rig import loopback_rig
 from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.loopback.rig import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
 from tests.flows.detect.detecting import model_in, scripted, short_slide, slip_when_busy

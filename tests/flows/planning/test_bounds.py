@@ -13,7 +13,7 @@ from annotated_types import Interval, Le, Lt
 from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
-from sliplab.flows.server.schedules import _MODELS, Ask
+from sliplab.plugins.web.server.schedules import _MODELS, Ask
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.yaml_file import validate

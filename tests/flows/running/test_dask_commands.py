@@ -18,7 +18,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
-from tests.flows.server.serving import until
+from tests.plugins.web.server.serving import until
 from tests.storage.remote.remotes import tree
 
 pytestmark = pytest.mark.programs

@@ -24,7 +24,7 @@ from sliplab.storage.trials.store import Store
 from tests.command_line import SLIPLAB
 from tests.flows.conftest import six_trials
 from tests.flows.programs import ended, running
-from tests.flows.server.serving import until
+from tests.plugins.web.server.serving import until
 
 pytestmark = pytest.mark.programs
 

@@ -24,7 +24,7 @@ from sliplab.flows.running.embedded_server import EmbeddedServer
 from tests.command_line import SLIPLAB
 from tests.flows.conftest import tiny, write
 from tests.flows.programs import ended, environment, running
-from tests.flows.server.serving import until
+from tests.plugins.web.server.serving import until
 
 pytestmark = pytest.mark.programs
 

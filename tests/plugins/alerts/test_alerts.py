@@ -15,12 +15,12 @@ import pytest
 import yaml
 
 from sliplab.flows.running import run_records
-from sliplab.flows.server.schedules import has_alerts
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
 from sliplab.plugins.alerts.conditions import Event, events
 from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
 from sliplab.plugins.alerts.watcher import AlertWatcher, AppriseTarget
+from sliplab.plugins.web.server.schedules import has_alerts
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import mask_secrets
 from sliplab.rigs.rig_file import load_rig_file, same_rig

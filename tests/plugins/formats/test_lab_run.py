@@ -17,7 +17,7 @@ from sliplab.storage.streams import Json
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
-from tests.storage.formats.adapter_streams import some_frames, write_frames
+from tests.plugins.adapters.adapter_streams import some_frames, write_frames
 from tests.storage.formats.files import SMALL, lab_cells
 
 pytestmark = pytest.mark.usefixtures("small")

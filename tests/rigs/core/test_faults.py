@@ -6,9 +6,9 @@ from typing import get_args
 
 import pytest
 
+from sliplab.plugins.ati_net_ft.fake import FakeNetFt, SensorFaultKind
 from sliplab.rigs.core import driver, faults
 from sliplab.rigs.core.fakes import FakeController, Kind
-from sliplab.rigs.devices.ati_net_ft.fake import FakeNetFt, SensorFaultKind
 
 FAKES = {
     "arm": FakeController,

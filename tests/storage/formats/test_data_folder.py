@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats import data_folder, tables
-from tests.storage.formats.adapter_streams import (
+from tests.plugins.adapters.adapter_streams import (
     BASE,
     EVENTS,
     adapter,
@@ -22,7 +22,7 @@ from tests.storage.formats.adapter_streams import (
     write_frames,
     zipped,
 )
-from tests.storage.formats.adapters import SLIDES, bring, slides
+from tests.plugins.adapters.adapters import SLIDES, bring, slides
 
 
 def test_a_zip_gives_what_its_folder_gives(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ import yaml
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
 from tests.command_line import here
+from tests.plugins.adapters.adapters import COUNTS, SLIDES, slides, touches
 from tests.plugins.formats.test_prophesee import HEADS, cd, dat, evt2, evt3, evt21, high, write
-from tests.storage.formats.adapters import COUNTS, SLIDES, slides, touches
 
 FORMS = ("evt2", "evt21", "evt3", "dat", "aedat4", "events.csv", "t.npy", "force.npz", "counts")
 HEAD = 128

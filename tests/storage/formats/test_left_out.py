@@ -35,8 +35,8 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
+from tests.plugins.adapters.adapters import SLIDES, bring, slides
 from tests.plugins.formats.test_lerobot import foreign
-from tests.storage.formats.adapters import SLIDES, bring, slides
 from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
 
 BACK = "events whose times run back"

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.adapters import streams as adapted_streams
 from sliplab.protocols.adapter_parts import EventFiles
-from sliplab.storage.formats import adapted_streams, aedat4, by_time, dsec, tables
+from sliplab.storage.formats import aedat4, by_time, dsec, tables
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import ForeignTrial
 from sliplab.storage.formats.import_trials import import_trials

@@ -1,0 +1,203 @@
+"""Runs started from Prefect's page: one at a time on the rig, stop requests at once.
+
+The service looks for runs that are due. One that moves the arm, or needs all cores, is carried out
+in a process of its own (`python -m sliplab.plugins.web.server.runs ID FLOW`), which ends with the
+service. Pause, resume and stop are carried out in threads of the service: they must wait neither
+for a process to load nor behind the collection that they are meant for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import os
+import sys
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from time import monotonic
+from typing import Any
+from uuid import UUID
+
+from sliplab.flows.running import console, orchestration, run_records, stopping
+from sliplab.flows.running.process import collect_garbage_seldom
+
+MOST_AT_ONCE = 16
+"""Requests to the arm that run at the same time."""
+STOP_LIMIT_S = 30.0
+"""Time in which a run must stop its arm and end, s; it is killed then."""
+
+
+class ServedRuns:
+    """The runs of one service.
+
+    Args:
+        store: its folder.
+        on_rig: the flow of each deployment whose runs go to a process, one at a time.
+        control: the flow of each deployment whose runs go to a thread.
+    """
+
+    def __init__(
+        self, store: Path, on_rig: Mapping[UUID, Any], control: Mapping[UUID, Any]
+    ) -> None:
+        self._store = store
+        self._on_rig, self._control = on_rig, control
+        self._run: Any = None
+        self._asked: Any = None
+        self._process: asyncio.subprocess.Process | None = None
+        self._stop_by: float | None = None
+        self._words: dict[UUID, asyncio.Future[None]] = {}
+
+    async def carry_out(self, poll_s: float, over: asyncio.Event) -> None:
+        """Carry out what the page asks for until `over`; then what runs is stopped, arm first.
+
+        Args:
+            poll_s: how often the server is asked, s.
+        """
+        from prefect.client.orchestration import get_client
+
+        ending = asyncio.create_task(over.wait())
+        with ThreadPoolExecutor(MOST_AT_ONCE, "page") as threads:
+            try:
+                async with get_client() as client:
+                    while not over.is_set():
+                        looking = asyncio.create_task(self._look(client, threads))
+                        await asyncio.wait({looking, ending}, return_when=asyncio.FIRST_COMPLETED)
+                        looking.cancel()
+                        with suppress(Exception, asyncio.CancelledError):
+                            await looking
+                        await asyncio.wait({ending}, timeout=poll_s)
+                await self._stop()
+            finally:
+                stopping.request()  # requests that wait for a trial's end do not delay the end
+
+    async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
+        """Check the run on the rig, and start due runs."""
+        if self._process is not None:
+            await self._supervise(client)
+        if self._asked is not None and self._process is None:
+            run = await client.read_flow_run(self._asked.id)
+            self._asked = None
+            if run.state.is_pending():
+                await self._start(run)
+        self._words = {run: word for run, word in self._words.items() if not word.done()}
+        due = await client.get_scheduled_flow_runs_for_deployments(
+            [*self._on_rig, *self._control], scheduled_before=datetime.now(UTC)
+        )
+        for run in due:
+            if run.deployment_id in self._control and run.id not in self._words:
+                flow, context = self._control[run.deployment_id], contextvars.copy_context()
+                self._words[run.id] = asyncio.get_running_loop().run_in_executor(
+                    threads, context.run, _carry_out_here, flow, run
+                )
+            elif run.deployment_id in self._on_rig and self._process is None:
+                await self._begin(client, run)
+
+    async def _begin(self, client: Any, run: Any) -> None:
+        from prefect.client.schemas.responses import SetStateStatus
+        from prefect.states import Pending
+
+        self._asked = run  # whose answer may be lost: it would stay pending for ever
+        answer = await client.set_flow_run_state(run.id, Pending())
+        self._asked = None
+        if answer.status is SetStateStatus.ACCEPT:
+            await self._start(run)
+
+    async def _start(self, run: Any) -> None:
+        """Start the process of a pending run."""
+        command = (sys.executable, "-P", "-m", "sliplab.plugins.web.server.runs", str(run.id))
+        self._run, self._stop_by = run, None
+        self._process = await asyncio.create_subprocess_exec(
+            *command, self._on_rig[run.deployment_id].name, start_new_session=True
+        )
+
+    async def _supervise(self, client: Any) -> None:
+        """Stop the run on the rig if the page cancels it; once it has ended, close it."""
+        assert self._process is not None
+        state = (await client.read_flow_run(self._run.id)).state
+        if self._process.returncode is None:
+            if state.is_cancelling():
+                self._terminate()
+            return
+        if not (state.is_final() or state.is_paused() or state.is_scheduled()):
+            await self._close(client, cancelled=state.is_cancelling())
+        self._process = None
+
+    def _terminate(self) -> None:
+        assert self._process is not None
+        with suppress(ProcessLookupError):
+            if self._stop_by is None:
+                self._stop_by = monotonic() + STOP_LIMIT_S
+                self._process.terminate()
+            elif monotonic() > self._stop_by:
+                self._process.kill()
+
+    async def _close(self, client: Any, *, cancelled: bool) -> None:
+        """Close a run whose process ended without the server knowing how it ended."""
+        from prefect.client.schemas.objects import State, StateType
+        from prefect.states import Cancelled, Crashed
+
+        assert self._process is not None
+        run = str(self._run.id)
+        if (retained := run_records.end_of(self._store, run)) is not None:
+            state: Any = State(type=StateType(retained["state"]), message=retained["message"])
+        elif cancelled:
+            state = Cancelled(message="stopped before it started")
+        else:
+            state = Crashed(message=f"its process was killed ({self._process.returncode})")
+        await client.set_flow_run_state(self._run.id, state, force=True)
+        run_records.end(self._store, run, state.type.value, state.message, "service")
+        run_records.delivered(self._store, run)
+
+    async def _stop(self) -> None:
+        """End what runs; its process says itself how it ended."""
+        while self._process is not None and self._process.returncode is None:
+            self._terminate()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._process.wait(), 1.0)
+
+
+def _carry_out_here(flow: Any, run: Any) -> None:
+    """Carry out one run to its end; how it ended is its state."""
+    from prefect.flow_engine import run_flow
+
+    try:
+        run_flow(flow, flow_run=run, return_type="state")
+    except BaseException as error:  # a thread has no caller to raise to
+        console.say(f"{run.name}: {error or type(error).__name__}")
+
+
+def _carry_out(run_id: str, flow_name: str) -> None:
+    """Execute one run in this process; its end is stored and reported to the server."""
+    collect_garbage_seldom()
+    orchestration.hide_what_a_lost_server_leaves()
+    from prefect.exceptions import Abort, Pause
+    from prefect.flow_engine import run_flow
+    from prefect.settings import temporary_settings
+
+    from sliplab.plugins.web.server.deployments import BESIDE, ON_RIG
+    from sliplab.plugins.web.server.service import service
+
+    (flow,) = (flow for flow in (*ON_RIG, *BESIDE) if flow.name == flow_name)
+    here = service()
+    link = orchestration.ServerLink(here.server)
+    with temporary_settings(updates=orchestration.limited_settings()), link.client() as client:
+        run = client.read_flow_run(UUID(run_id))
+        try:
+            run_flow(flow, flow_run=run, return_type="state")
+        except (Abort, Pause):
+            pass  # the server requested it
+        except Exception as error:
+            link.mark_lost(error)
+            if (retained := run_records.end_of(here.folder, run_id)) is not None:
+                run_records.record_undelivered_end(
+                    here.folder, run_id, retained["state"], retained["message"]
+                )
+    if not orchestration.close():
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    _carry_out(*sys.argv[1:])

@@ -1,0 +1,31 @@
+"""The web application of a store as a browser gets it that has opened one of its links."""
+
+from __future__ import annotations
+
+from starlette.testclient import TestClient
+
+from sliplab.plugins.web.pages.access import Access, Viewer
+from sliplab.plugins.web.pages.app import application
+from sliplab.plugins.web.pages.web import Web
+from sliplab.plugins.web.review.trial_list import TrialList
+from sliplab.plugins.web.server.links import Role
+from sliplab.storage.trials.store import Store
+
+ACCESS = Access({"operator": "o" * 40, "reader": "r" * 40})
+
+
+def opened(
+    store: Store, reviews: TrialList | None = None, role: Role | None = "operator"
+) -> TestClient:
+    """A browser that opened the link of a role, or none."""
+    found = TestClient(application(Web(store, ACCESS, reviews=reviews)), follow_redirects=False)
+    if role is not None:
+        assert found.get(f"/enter?token={ACCESS.tokens[role]}").status_code == 200
+    return found
+
+
+def csrf(browser: TestClient, address: str = "") -> str:
+    """The token of a browser's forms at an address."""
+    viewer = ACCESS.viewer(dict(browser.cookies), address)
+    assert isinstance(viewer, Viewer)
+    return viewer.csrf

@@ -1,0 +1,133 @@
+"""Runs of a service that are killed, or suspended from Prefect's page."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID, uuid4
+
+import pytest
+
+from sliplab.plugins.web.server.runs import ServedRuns
+from sliplab.storage.files import read_json
+from sliplab.storage.remote.objects import LAYOUT_FILE
+from sliplab.storage.trials.store import Store
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, write
+from tests.plugins.web.server.serving import Page, serving, until
+
+pytestmark = pytest.mark.programs
+
+RIG = ROOT / "rigs" / "rehearsal.yaml"
+
+
+def process_of(run: str) -> int:
+    """The process that carries out a run; 0 where there is none."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_text().split("\0")
+        except OSError:  # it has ended meanwhile
+            continue
+        if "sliplab.plugins.web.server.runs" in words and run in words:
+            return int(path.parent.name)
+    return 0
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A service with a push that hangs: its place's marker is a pipe that nobody writes to."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "remote").mkdir()
+    os.mkfifo(folder / "remote" / LAYOUT_FILE)
+    nights = folder / "schedules.yaml"  # its folder is one from which protocols may be named
+    nights.write_text(
+        "timezone: UTC\nschedules:\n"
+        f"  - {{name: copy, flow: push, url: 'file://{folder}/remote', cron: '0 0 1 1 *'}}\n"
+    )
+    Store.create(folder / "store")
+    with serving(folder / "store", RIG, "ends", None, folder / "log", nights) as found:
+        yield found
+
+
+def test_a_run_whose_begin_got_no_answer_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server took it, and answered too late: it would stay pending, and its night be lost."""
+    from prefect.states import Pending, Scheduled
+
+    run = SimpleNamespace(id=uuid4(), deployment_id=uuid4(), state=Scheduled())
+
+    class Client:
+        async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
+            return [run] if run.state.is_scheduled() else []
+
+        async def read_flow_run(self, wanted: UUID) -> Any:
+            return run
+
+        async def set_flow_run_state(self, wanted: UUID, state: Any) -> None:
+            run.state = Pending()
+            raise TimeoutError
+
+    begun: list[Any] = []
+
+    async def start(served: ServedRuns, wanted: Any) -> None:
+        begun.append(wanted)
+
+    monkeypatch.setattr(ServedRuns, "_start", start)
+    served, client, threads = ServedRuns(tmp_path, {run.deployment_id: None}, {}), Client(), None
+    with pytest.raises(TimeoutError):
+        asyncio.run(served._look(client, threads))
+    assert begun == []
+    for _ in range(2):
+        asyncio.run(served._look(client, threads))
+    assert begun == [run]
+
+
+def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:
+    folder = page.log.parent
+    protocol = write(folder / "protocol.yaml", tiny())
+    store = folder / "store"
+    trials, records = store / "campaigns" / "tiny" / "trials", store / "control" / "runs"
+    killed = page.run("collect", protocol=str(protocol))["id"]
+    until("a trial", lambda: trials.is_dir() and any(trials.iterdir()))
+    os.kill(process_of(killed), signal.SIGKILL)
+    said = page.ended(killed)
+    assert (said["type"], said["message"]) == ("CRASHED", "its process was killed (-9)")
+    assert len(list(trials.iterdir())) < 6
+
+    suspended = page.run("collect", protocol=str(protocol))["id"]
+    until("a run", lambda: page.state(suspended)["type"] == "RUNNING")
+    paused = {"type": "PAUSED", "name": "Suspended", "state_details": {"pause_reschedule": True}}
+    answer = page.call(f"/flow_runs/{suspended}/set_state", {"state": paused})
+    assert answer["status"] == "ACCEPT", answer
+    until("its process", lambda: not process_of(suspended))
+    assert page.state(suspended)["type"] == "PAUSED"
+    page.call(f"/flow_runs/{suspended}/resume", {})
+    assert page.ended(suspended)["type"] == "COMPLETED", page.log.read_text()
+    assert len(list(trials.iterdir())) == 6
+    ends = [read_json(path) for path in records.glob("*.end.json")]
+    assert sorted((end["state"], end["by"]) for end in ends) == [
+        ("COMPLETED", "flow"),
+        ("CRASHED", "service"),
+    ]
+
+
+@pytest.mark.long
+def test_a_push_that_hangs_delays_no_collection(page: Page) -> None:
+    data = tiny()
+    data["name"] = "beside"
+    protocol = write(page.log.parent / "beside.yaml", data)
+    pushing = page.run("push")["id"]
+    until("the push", lambda: page.state(pushing)["type"] == "RUNNING")
+    taking = page.run("collect", protocol=str(protocol), trials=1)["id"]
+    said = page.ended(taking)
+    assert said["type"] == "COMPLETED", page.log.read_text()
+    assert "1 of 6 committed" in said["message"]
+    assert page.state(pushing)["type"] == "RUNNING"
+    page.cancel(pushing)
+    assert page.ended(pushing)["type"] == "CANCELLED"
