@@ -59,10 +59,10 @@ BELIEVED = {
     "utc": {"right"},
     "host": {"right", "pushed_late"},
 }
-AT_ONCE = {
-    "host": {"another_epoch", "far_future", "far_past"},
-}
+AT_ONCE = {"host": {"another_epoch", "far_future", "far_past"}}
 """Stamps more than a day from the host's clock are errors of `push`."""
+if time.monotonic_ns() > 86_400 * S:  # the host has been up for longer
+    AT_ONCE["host"] |= {"from_zero", "seconds_for_ns", "us_for_ns"}
 
 
 def source_ns(clock: str) -> int:
@@ -102,7 +102,8 @@ def test_rows_keep_the_stamps_they_came_with_and_wrong_clocks_are_refused(
     streams = [push(name, {"a": "N"}, clock=clock, uncertainty_ms=stated) for name in STAMPS]
     with record(streams, tmp_path, "stamps") as recorder, recorder.trial() as trial:
         taken = pushed(trial.push, clock)
-    assert verify(str(tmp_path))["ok"]
+    checked = verify(str(tmp_path))
+    assert checked["ok"]
     (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
     clocks, about = recording.clocks, recording.record.imported
     there = {name for name, stamps in taken.items() if stamps}
@@ -112,6 +113,9 @@ def test_rows_keep_the_stamps_they_came_with_and_wrong_clocks_are_refused(
     assert not about.dropped
     assert {name for name in clocks.streams if not name.endswith("_clock")} == BELIEVED[clock]
     assert set(clocks.refused) == there - BELIEVED[clock]
+    assert checked["no_clock"] == {"stamps/000001": clocks.refused}
+    assert f"row {STEPS // 2 + 2}" in clocks.refused["one_ahead"]
+    assert f"row {STEPS // 2 + 1}" in clocks.refused["one_behind"]
     for name, why in clocks.refused.items():
         assert f"the clock of {name} is not known: {why}" in about.warnings
         assert "rig file" not in why
