@@ -13,8 +13,13 @@ import sys
 import threading
 from contextlib import suppress
 
-from sliplab.flows.running import exit_codes
-from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
+_PROGRAM = __name__ == "__main__" or sys.argv[0].endswith("/sliplab")
+if _PROGRAM and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # no traceback from a module that is just imported
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
+from sliplab.flows.running import exit_codes  # noqa: E402
+from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads  # noqa: E402
 
 END_LIMIT_S = 1.0
 """Longest wait for semaphores to be removed when the program ends at once, s."""

@@ -34,6 +34,7 @@ class Verification(TypedDict):
         salvaged: trials that are not all that was recorded, as ``campaign/trial``.
         failed_gates: gates that imported trials do not pass, by ``campaign/trial``.
         dropped: rows that were left out of trials, by ``campaign/trial`` and reason.
+        no_clock: why streams have no clock, by ``campaign/trial`` and stream.
     """
 
     trials: int
@@ -48,6 +49,7 @@ class Verification(TypedDict):
     salvaged: NotRequired[list[str]]
     failed_gates: NotRequired[dict[str, list[str]]]
     dropped: NotRequired[dict[str, dict[str, int]]]
+    no_clock: NotRequired[dict[str, dict[str, str]]]
 
 
 def verify(place: str, quarantine: bool = False) -> Verification:
@@ -97,6 +99,8 @@ def verify(place: str, quarantine: bool = False) -> Verification:
             result.setdefault("failed_gates", {})[trial] = gates
         if record.imported is not None and record.imported.dropped:
             result.setdefault("dropped", {})[trial] = record.imported.dropped
+        if record.clocks.refused:
+            result.setdefault("no_clock", {})[trial] = record.clocks.refused
     return result
 
 

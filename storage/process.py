@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import getpass
 import multiprocessing
@@ -34,6 +35,13 @@ _OF_TERMINAL = signal.SIGINT, signal.SIGHUP
 """Signals that a terminal sends to all of its processes."""
 _F_SETSIG = 10
 """Linux's `fcntl` command that chooses the signal of O_ASYNC; Python has no name for it."""
+
+
+def give_memory_back() -> None:
+    """Return freed memory to the system, which glibc's allocator keeps between what is in use."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def this_process() -> Json:

@@ -19,6 +19,7 @@ from sliplab.analysis.detectors.detector import (
     checked,
 )
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
+from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import EventChunk
 
 WARM_UP_US = 1_000_000
@@ -54,15 +55,13 @@ class AtLevel(StreamDetector):
         self.resume(0)
 
     def warm_up(self, width: int, height: int) -> None:
-        """Push a second without events. Raises DetectorError: that is slip at this level."""
+        """Push a second without events. Raises InputError: that is slip at this level."""
         self.begin(width, height)
         quiet = self.push(EventChunk.empty(), WARM_UP_US).value.max(initial=-np.inf)
         # one that nothing bounds is infinite; a positive one may be meant, to try an alarm
         if -np.inf < self.level < min(quiet, 0):
-            raise DetectorError(
-                f"level {self.level:g}: without an event its evidence is {quiet:g} already, so all "
-                "would be slip; state a higher level"
-            )
+            text = f"must be higher: without an event its evidence is {quiet:g} already"
+            raise InputError("detect", "level", self.level, text)
 
     def resume(self, at_us: int) -> None:
         """Begin a new scene. Raises DetectorError."""

@@ -36,6 +36,7 @@ SHOWN = (
     "simulated",
     "unread_bytes",
     "rows_lost",
+    "no_clock",
 )
 """Columns of the catalogue that fit a terminal."""
 
@@ -130,6 +131,9 @@ def verify(
     for trial, reasons in found.get("dropped", {}).items():
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
         console.say(f"{trial}: intact, but without {counts}")
+    for trial, refused in found.get("no_clock", {}).items():
+        for stream, why in refused.items():
+            console.say(f"{trial}: intact, but {stream} has no clock: {why}")
     if as_json:
         console.print_json(found)
     else:

@@ -149,6 +149,9 @@ def _rows(path: Path, unit: str | None) -> tuple[list[str], list[TableRow], str,
     time, named = _time_column(name, columns)
     if not rows:
         raise InputError(name, "", None, f"is empty below its heading {', '.join(columns)}")
+    if unit is not None and named not in {None, unit}:
+        text = f"names the unit {named}, and --unit {unit}: leave one out"
+        raise InputError(name, "heading", time, text)
     return columns, rows, time, unit or named or "s"
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from sliplab.storage.streams import CLOCK, EVENTS_KIND, FRAMES_KIND, I64, ClockR
 from sliplab.storage.trials.checksums import DATA, stream_file
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
-from sliplab.storage.trials.verify import runs_backwards
+from sliplab.storage.trials.verify import falls
 
 AHEAD_NS = 1_000_000_000
 """How long after they came times of the host's clock may lie where no error is stated."""
@@ -156,17 +157,25 @@ def _wrong_times(
     """Return why a stream's times cannot be right whatever its clock; None if they can."""
     if not source.record.of_camera:  # whose times do not fall back: late rows are left out
         with StreamReader(folder / DATA) as reader:
-            if runs_backwards(reader, f"{STREAM_GROUP}/{name}/t"):
-                return "its times fall back: the clock was set, or several clocks stamped the rows"
+            fallen = list(islice(falls(reader, f"{STREAM_GROUP}/{name}/t"), 2))
+        if fallen:
+            why = "the clock was set, or several clocks stamped the rows"
+            where = " and ".join(f"row {row + 1}" for row in fallen)
+            return f"its times fall back at {where}: {why}"
     if source.clock != HOST:
         return None
-    own, came = _arrivals(folder, name, source)
+    own, came, row = _arrivals(folder, name, source)
     if not own.size:
         return None
-    ahead_ns, newest_ns = int((own - came).max()), int(own.max())
+    furthest = int((own - came).argmax())
+    ahead_ns, newest_ns = int((own - came)[furthest]), int(own.max())
     most_ns = AHEAD_NS if source.uncertainty_ns is None else source.uncertainty_ns
     if ahead_ns > most_ns:
-        return f"its times lie up to {ahead_ns / 1e9:.6f} s after they came"
+        what = "row" if source.record.kind != EVENTS_KIND else "reading"
+        return (
+            f"its times lie up to {ahead_ns / 1e9:.6f} s after they came, at {what} "
+            f"{row[furthest] + 1}"
+        )
     if newest_ns < span_ns[0] - most_ns:
         before_s = (span_ns[0] - newest_ns) / 1e9
         return f"all its times lie before the trial, by {before_s:.6f} s at least"
@@ -186,8 +195,9 @@ def _wrong_times(
     return None
 
 
-def _arrivals(folder: Path, name: str, source: SourceAbout) -> tuple[I64, I64]:
-    """Return the times of some thousand rows and when they came, ns; of events of the newest."""
+def _arrivals(folder: Path, name: str, source: SourceAbout) -> tuple[I64, I64, I64]:
+    """Return the times of some thousand rows, when they came, ns, and the rows; of events of the
+    newest."""
     file, group, came = DATA, f"{STREAM_GROUP}/{name}", "host"
     if source.record.kind == EVENTS_KIND:
         group, came = f"{STREAM_GROUP}/{CLOCK_STREAM.format(name)}", "after"
@@ -195,18 +205,19 @@ def _arrivals(folder: Path, name: str, source: SourceAbout) -> tuple[I64, I64]:
         file, group = DATA if name in FIRST_CAMERAS else stream_file(name), FRAMES_KIND
     with StreamReader(folder / file) as reader:
         if not reader.has(f"{group}/{came}"):
-            return np.empty(0, np.int64), np.empty(0, np.int64)
+            return (np.empty(0, np.int64),) * 3
         parts = zip(
             reader.column_parts(f"{group}/t"), reader.column_parts(f"{group}/{came}"), strict=True
         )
-        found = []
+        found, begin = [], 0
         for own, host in parts:
             some = np.arange(0, len(own), max(1, len(own) // 1000))
             some = np.r_[some, np.argmax(own), np.argmax(own - host)]
-            found.append(np.stack([own[some], host[some]]))
+            found.append(np.stack([own[some], host[some], begin + some]))
+            begin += len(own)
     times = np.concatenate(found, axis=1)
     order = np.argsort(times[1], kind="stable")
-    return times[0, order], times[1, order]
+    return times[0, order], times[1, order], times[2, order]
 
 
 def _reads(reader: StreamReader, name: str) -> tuple[ClockReads, int]:

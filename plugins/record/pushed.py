@@ -237,8 +237,10 @@ class PushedStream:
             found = np.atleast_1d(np.array(value))
         except ValueError:  # lists of different lengths
             found = np.empty(0, object)
-        if found.dtype.kind not in "biuf":
+        if found.dtype.kind not in "iuf":
             raise InputError(self._name, name, value, "must be a number, or numbers")
+        if found.dtype.itemsize > 8:  # long double
+            found = found.astype(np.float64)
         if (
             found.dtype.kind in "iu"
             and found.size

@@ -34,19 +34,21 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.units import TABLE
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_lock import lock_file, locked
-from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import safe_name, write_json
 from sliplab.storage.interrupts import uninterrupted
+from sliplab.storage.process import give_memory_back
 from sliplab.storage.schema.trial import Mark, Provenance, TrialRecord
-from sliplab.storage.streams import FRAMES_KIND, Chunk
+from sliplab.storage.streams import FRAMES_KIND, Chunk, Json
 from sliplab.storage.trials.prefix_journal import BEGUN
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.writer import TrialWriter
 from sliplab.storage.versions import RECORDING, installed_versions
 
 POLL_S = 0.01
-MARK_S = 0.3
-"""Time between two states in a trial's journal: with the disk's, what a crash can lose, s."""
+MARK_S, TRIM_S = 0.3, 10.0
+"""Time between two states in a trial's journal: with the disk's, what a crash can lose, s; and
+between two returns of freed memory to the system, which else grows with every burst."""
 TAIL_S = 0.1
 """Time for which streams are read after the end of a trial: data are on their way, s."""
 START_S, END_S = 60.0, 600.0
@@ -97,7 +99,12 @@ class Recorder:
     ) -> None:
         self._tap, self._pulses = tap, pulses
         self._streams = [streams] if isinstance(streams, (str, Path, Source)) else list(streams)
-        self._store, self._name = Path(store), safe_name(campaign)
+        self._store, self._name = Path(store), campaign
+        try:
+            safe_name(campaign)
+        except StoreError:
+            text = "must be a folder's name: letters, digits and . _ - = , + are possible"
+            raise InputError("record", "campaign", campaign, text) from None
         self._operator, self._simulated = operator, simulated
         self._analysis = None if analysis is None else Path(analysis)
         self._collects = collects
@@ -215,6 +222,7 @@ class RecordedTrial:
         self._ended_by = ""
         self._lock = threading.Lock()
         self._marks: list[Mark] = []
+        self._described: dict[str, Json] | None = None
         self._drained = False
         self.begin_ns = self._end_ns = 0
         self.bytes_written = 0
@@ -315,12 +323,15 @@ class RecordedTrial:
         return {source.name: source.rows for source in self._recorder.sources}
 
     def lost(self) -> dict[str, int]:
-        """Return what is known to be lost so far, by stream."""
+        """Return what is known to be lost so far, by stream; at the end what the record says."""
+        described = self._described
+        if described is None:
+            described = {s.name: s.stream.describe() or {} for s in self._recorder.sources}
         found = {}
-        for source in self._recorder.sources:
-            counts = (source.stream.describe() or {}).get("counts", {})
+        for name, about in described.items():
+            counts = about.get("counts", {})
             if lost := sum(int(counts.get(key, 0)) for key in LOST):
-                found[source.name] = lost
+                found[name] = lost
         return found
 
     def _note(self, writer: TrialWriter, begun: BegunTrial, changed: bool = False) -> None:
@@ -394,7 +405,7 @@ class RecordedTrial:
             self.begin_ns = begun.begin_ns = time.monotonic_ns()
             self._note(writer, begun, changed=True)
             self._began.set()
-            noted = time.monotonic()
+            noted = trimmed = time.monotonic()
             while not self._end.wait(POLL_S):
                 self._drain(writer, begun)
                 if time.monotonic() - noted >= MARK_S:
@@ -402,6 +413,9 @@ class RecordedTrial:
                     self._note(writer, begun)
                     self.bytes_written = sum(p.stat().st_size for p in writer.folder.iterdir())
                     noted = time.monotonic()
+                if noted - trimmed >= TRIM_S:
+                    give_memory_back()
+                    trimmed = noted
             tail = time.monotonic() + TAIL_S
             while time.monotonic() < tail:
                 self._drain(writer, begun)
@@ -434,6 +448,7 @@ class RecordedTrial:
         notes = [f"ended by {self._ended_by}"] if self._ended_by else []
         notes += [f"{fault}; the stream ended there" for fault in self.faults.values()]
         devices = {s.name: about for s in sources if (about := s.stream.describe()) is not None}
+        self._described = devices  # devices may still count what comes behind the end
         self._note(writer, begun)
         folder = writer.seal()
         record = make_record(folder, begun, self._end_ns, tuple(notes), devices=devices)

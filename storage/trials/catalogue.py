@@ -44,7 +44,7 @@ else:
     pa = Later("pyarrow")
     pq = Later("pyarrow.parquet")
 
-VERSION = 3
+VERSION = 4
 """Of the index and of the catalogue's rows: a change of either counts on."""
 FRESH_NS = 2_000_000_000
 """Age below which a change may not show in a time stamp: some disks count in seconds."""
@@ -56,6 +56,8 @@ UNREAD = "unread_bytes"
 """Column of a catalogue with salvaged trials: the number of unread bytes of their files."""
 DROPPED = "rows_lost"
 """Column of a catalogue with trials some rows of which were left out: how many."""
+NO_CLOCK = "no_clock"
+"""Column of a catalogue with trials some streams of which have no clock: their names."""
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
@@ -391,6 +393,8 @@ def _missing(recording: Recording) -> Row:
     cells: Row = {} if lost is None else {UNREAD: lost.unread_bytes}
     if imported is not None and imported.dropped:
         cells[DROPPED] = sum(imported.dropped.values())
+    if refused := recording.record.clocks.refused:
+        cells[NO_CLOCK] = ", ".join(refused)
     return cells
 
 

@@ -336,13 +336,17 @@ def _data_problems(
 
 
 def runs_backwards(reader: StreamReader, name: str) -> bool:
-    """Return whether a column of times falls anywhere; one part at a time is in memory."""
-    last: np.generic | None = None
+    """Return whether a column of times falls anywhere."""
+    return next(falls(reader, name), None) is not None
+
+
+def falls(reader: StreamReader, name: str) -> Iterator[int]:
+    """Yield the rows at which a column of times falls; one part at a time is in memory."""
+    last, begin = None, 0
     for part in reader.column_parts(name):
-        if (last is not None and part[0] < last) or np.any(part[1:] < part[:-1]):
-            return True
-        last = part[-1]
-    return False
+        before = np.concatenate([part[:1] if last is None else last, part[:-1]])
+        yield from (begin + np.flatnonzero(part < before)).tolist()
+        last, begin = part[-1:], begin + len(part)
 
 
 def leads_to_events(reader: StreamReader) -> bool:

@@ -46,7 +46,7 @@ RETAINED = 4
 FIRST_COLUMNS = ("campaign", "trial", "recorded_s", "events", "frames", "attempt", "passed")
 _RECORD_COLUMNS = frozenset(
     {"experiment", "role", "repetition", "block", "simulated", "frame_source"}
-    | {"sync_uncertainty_us", "unread_bytes", "rows_lost", *FIRST_COLUMNS}
+    | {"sync_uncertainty_us", "unread_bytes", "rows_lost", "no_clock", *FIRST_COLUMNS}
 )
 """Columns of the catalogue that are no condition's."""
 _FILTERS = ("campaign", "text", "where", "sort", "columns")

@@ -154,5 +154,6 @@ def test_what_cannot_be_had_is_said(tmp_path: Path) -> None:
         assert done.returncode == 2
         assert said in json.loads(done.stdout)["error"]["message"]
     always = here(*asked, "--detector", "rate", "--level", "-5")
-    assert always.returncode == 1
-    assert "level -5: without an event its evidence is 0 already" in always.stderr
+    assert always.returncode == 2
+    right = "level = -5.0: must be higher: without an event its evidence is 0 already"
+    assert right in json.loads(always.stdout)["error"]["message"]

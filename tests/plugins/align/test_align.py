@@ -304,6 +304,7 @@ def test_refusals_name_the_likely_cause(tmp_path: Path, name: str) -> None:
         (["--out", "none/c.csv"], "--out = none/c.csv: its folder does not exist"),
         (["--unit", "h"], "unit = h: must be one of s, ms, us, ns"),
         (["--unit", "kg"], "--unit = kg: must be one of s, ms"),
+        (["--unit", "ms"], "heading = t_s: names the unit s, and --unit ms: leave one out"),
         (["--within", "0.2"], "--within = 0.2: needs --offset"),
         (["--taps", "--harp"], "--taps = true: goes without --harp"),
         (["--taps", "--out", "c.csv"], "--out = c.csv: needs --map"),
@@ -311,7 +312,7 @@ def test_refusals_name_the_likely_cause(tmp_path: Path, name: str) -> None:
 )
 def test_wrong_options_are_named(tmp_path: Path, options: list[str], text: str) -> None:
     for name in ("a.csv", "b.csv"):
-        (tmp_path / name).write_text(PLAIN)
+        (tmp_path / name).write_text(PLAIN.replace("t\n", "t_s\n", 1))
     done = here("align", tmp_path / "a.csv", tmp_path / "b.csv", *options)
     assert done.returncode == 2
     assert text in done.stderr

@@ -82,10 +82,11 @@ def test_for_and_every_make_trials_of_their_length(tmp_path: Path, streams: Path
         (["lsl:x", "--set", "grip_n=1", "--set", "grip=2"], "gives the factor grip a second time"),
         (["usb:/dev/video0@big"], "must be usb:DEVICE@WIDTHxHEIGHT"),
         (["rehearsal.yaml"], "no such file"),
+        (["lsl:x", "--campaign", "../x"], "must be a folder's name"),
     ],
 )
 def test_wrong_words_are_refused(tmp_path: Path, words: list[str], said: str) -> None:
-    done = here("record", *words, "--store", tmp_path / "store", "--campaign", "rows")
+    done = here("record", "--store", tmp_path / "store", "--campaign", "rows", *words)
     assert done.returncode == 2
     assert said in done.stderr.replace("\n", " ")
 

@@ -217,7 +217,7 @@ def test_values_are_those_of_the_moment_they_were_pushed(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "value", [None, "x", b"3", 1 + 2j, 2**60 + 1, -(2**60), 10**400, [[1], [1, 2]]], ids=str
+    "value", [None, True, "x", b"3", 1 + 2j, 2**60 + 1, -(2**60), 10**400, [[1], [1, 2]]], ids=str
 )
 def test_values_that_are_no_numbers_or_would_be_rounded_are_refused(value: object) -> None:
     source = push("pull", {"fx": "N", "fy": "N"})
