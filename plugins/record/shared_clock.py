@@ -78,11 +78,13 @@ def explained(clock: str, reads: ClockReads) -> str:
     width = (reads.after_ns - reads.before_ns).astype(np.float64)
     off = (reads.device_ns - reads.before_ns) - width / 2
     # the clock itself is read at once; a stamp was made some time before it came
-    stamps = width > np.sqrt(max(width.min(), 1.0) * width.max())
-    off = off[stamps] - np.median(off[~stamps])
-    if not off.size or np.ptp(off) > 2 * _APART_NS or np.abs(off).min() < _APART_NS:
+    wide = width > np.sqrt(max(width.min(), 1.0) * width.max())
+    off -= np.median(off[~wide])
+    # among the wide ones are readings of the clock itself during which the host did something else
+    stamps = off[wide & (np.abs(off) >= _APART_NS)]
+    if 2 * stamps.size <= wide.sum() or np.ptp(stamps) > 2 * _APART_NS:
         return ""
-    by_s = float(np.median(off)) / BILLION
+    by_s = float(np.median(stamps)) / BILLION
     scale, utc_s = SHARED[clock], -tai_s() if clock == "ptp" else 0
     found = f"its stamps are {abs(by_s):.3f} s {'ahead of' if by_s > 0 else 'behind'} {scale}"
     offsets = {"utc": utc_s, "ptp": utc_s + tai_s(), "own": utc_s + tai_s() - GPS_S}
