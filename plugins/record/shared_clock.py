@@ -77,12 +77,15 @@ def explained(clock: str, reads: ClockReads) -> str:
     """
     width = (reads.after_ns - reads.before_ns).astype(np.float64)
     off = (reads.device_ns - reads.before_ns) - width / 2
-    # the clock itself is read at once; a stamp was made some time before it came
-    wide = width > np.sqrt(max(width.min(), 1.0) * width.max())
-    off -= np.median(off[~wide])
-    # among the wide ones are readings of the clock itself during which the host did something else
-    stamps = off[wide & (np.abs(off) >= _APART_NS)]
-    if 2 * stamps.size <= wide.sum() or np.ptp(stamps) > 2 * _APART_NS:
+    # the clock itself is read at once, unless the host was busy
+    off -= off[np.argmin(width)]
+    wrong = np.abs(off) >= _APART_NS
+    if not wrong.any():
+        return ""
+    # how long before its arrival a stamp may have been made is stated, and the same for all
+    right = ~wrong & np.isclose(width, np.median(width[wrong]), rtol=0.01)
+    stamps = off[wrong]
+    if stamps.size <= right.sum() or np.ptp(stamps) > 2 * _APART_NS:
         return ""
     by_s = float(np.median(stamps)) / BILLION
     scale, utc_s = SHARED[clock], -tai_s() if clock == "ptp" else 0
