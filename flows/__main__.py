@@ -14,7 +14,9 @@ import threading
 from contextlib import suppress
 
 _PROGRAM = __name__ == "__main__" or sys.argv[0].endswith("/sliplab")
-if _PROGRAM and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+# it imports the program of its parent, with the same arguments
+_WORKER = "--multiprocessing-fork" in sys.orig_argv
+if _PROGRAM and not _WORKER and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # no traceback from a module that is just imported
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
