@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sliplab.plugins.uvc.capture import Taken
-from sliplab.plugins.uvc.settings import UvcSettings, is_camera
+from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
@@ -34,9 +34,10 @@ class VideoStamping(NamedTuple):
     grade: str
 
 
-def why_unreachable(device: str) -> str | None:
+def why_unreachable(settings: UvcSettings) -> str | None:
     """Return why a device cannot be opened, as far as its path says; None if it may be."""
-    if not is_camera(device):
+    device = settings.device
+    if not settings.is_camera:
         return None if "://" in device or Path(device).exists() else f"there is no {device}"
     try:
         kind = os.stat(device).st_mode

@@ -11,11 +11,6 @@ from sliplab.protocols.yaml_file import rule
 from sliplab.rigs.core.device_settings import FrameCameraSettings
 
 
-def is_camera(path: str) -> bool:
-    """Return whether a path is a device's; files in memory are none."""
-    return path.startswith("/dev/") and not path.startswith("/dev/shm/")
-
-
 class UvcSettings(FrameCameraSettings):
     """A USB camera, which runs by itself and stamps nothing that could be trusted."""
 
@@ -56,5 +51,5 @@ class UvcSettings(FrameCameraSettings):
 
     @property
     def is_camera(self) -> bool:
-        """True for a device of V4L2; False for a file, a pipe or a URL."""
-        return is_camera(self.device)
+        """True for a device of V4L2; False for a file, also one in memory, a pipe or a URL."""
+        return self.device.startswith("/dev/") and not self.device.startswith("/dev/shm/")

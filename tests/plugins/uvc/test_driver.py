@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sliplab.plugins.uvc import driver
 from sliplab.plugins.uvc.capture import Capture, configure
 from sliplab.plugins.uvc.device import DRIVER
 from sliplab.plugins.uvc.driver import UvcCamera
@@ -113,7 +112,9 @@ def test_a_setting_that_is_not_taken_is_refused(code: int, kept: float, message:
 
 
 def test_a_path_that_cannot_be_a_camera_is_named(tmp_path: Path) -> None:
-    unreachable = driver.why_unreachable
+    def unreachable(device: str) -> str | None:
+        return DRIVER.ping(UvcSettings(device=device))
+
     assert unreachable("/dev/null") is None
     assert "No such file" in str(unreachable("/dev/video-none"))
     assert "is not a device" in str(unreachable("/dev/shm"))
