@@ -82,6 +82,7 @@ class Ledger:
         self.files: Sums = {}
         self._ended = True
         self.damaged: dict[str, tuple[str, Sums]] = {}
+        self._moving: set[str] = set()
         self.owed: set[str] = set()
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
@@ -173,9 +174,10 @@ class Ledger:
                 raise Wrong("a log is true", f"quarantine/{name} has no cause")
             if cause.startswith("gate") and calm and name.rpartition(".")[0] not in self.unfinished:
                 gates = TrialRecord.load(path.with_name("record.json")).quality.gates
-                # limits of the clocks are close: chance alone is beyond them now and then
+                # limits of the clocks are close: chance alone is beyond them now and then, or
+                # leaves a short trial without a clock, so that nothing is known of its gaps
                 odd = [n for n, g in gates.items() if not g.passed and not n.startswith("sync_")]
-                if odd:
+                if odd and not any(isinstance(g.value, str) for g in gates.values()):
                     raise Wrong("what is in order passes its gates", f"{name}: {odd}")
         self.aside = aside
 
@@ -207,6 +209,7 @@ class Ledger:
             self._check_new(name, aside)
             self.takes.setdefault(name, []).append(now[name])
         self.trials = {name: now[name] for name in now.keys() - moving}
+        self._moving = moving
         self.damaged = {name: how for name, how in self.damaged.items() if name in self.trials}
 
     def _check_new(self, name: str, aside: dict[str, Sums]) -> None:
@@ -495,7 +498,8 @@ class Ledger:
             raise Wrong("a status is true", one.problem.replace(str(self._folder), ""))
         out = {item["trial"] for item in one.excluded}
         cut = {name for name, (how, _) in self.damaged.items() if how == "cut"}
-        there = self.trials.keys() - cut  # a changed byte is found by `verify` only
+        # a changed byte is found by `verify` only; a kill may leave a trial where it was
+        there = (self.trials.keys() | self._moving) - cut
         counts = (one.committed, one.planned - one.missing - len(out), one.simulated)
         if counts != (len(there), len(there), True):
             raise Wrong("a status is true", f"says {counts}, there are {len(there)}")

@@ -51,6 +51,7 @@ from sliplab.storage.remote import pull as pulling
 from sliplab.storage.remote.objects import Remote, RemoteError
 from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import PushOptions, push
+from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
@@ -383,6 +384,8 @@ def bring(process: Process, step: dict[str, Any]) -> None:
     folder = process.stage.store / "campaigns" / NAME / "trials"
     if not file.exists():
         trials = sorted(folder.iterdir()) if folder.is_dir() else []
+        # not every rig has an event camera
+        trials = [each for each in trials if TrialRecord.load(each / "record.json").counts.events]
         if not trials:
             return
         shutil.copy(trials[0] / "data.h5", file)
