@@ -460,10 +460,13 @@ class _Fit:
         return _Part(piece, run, state, outliers, doubt)
 
     def _finished(self, parts: list[_Part], by: str) -> Alignment:
-        jumps: list[Jump] = []
-        for k in range(len(parts) - 1):
-            jump, parts[k : k + 2] = self._jump(parts[k], parts[k + 1])
-            jumps.append(jump)
+        least = MIN_EVENTS // 2 if by == "pattern" else MIN_KNOWN
+        jumps, kept = self._jumps(parts)
+        while thin := [k for k, part in enumerate(kept) if part.run.a.size < least]:
+            # what the jumps on both sides leave so little of was paired by chance
+            parts = [part for k, part in enumerate(parts) if k != thin[0]]
+            jumps, kept = self._jumps(parts)
+        parts = kept
         stretches = []
         for k, part in enumerate(parts):
             lower = self._open_end(part, False) if k == 0 else None
@@ -554,6 +557,14 @@ class _Fit:
         seen = int(((predicted >= other[0]) & (predicted <= other[-1])).sum())
         there = int(((other >= predicted[0]) & (other <= predicted[-1])).sum())
         return self._ns(part, -1 if behind else 0) if min(seen, there) > _BETWEEN else None
+
+    def _jumps(self, parts: list[_Part]) -> tuple[list[Jump], list[_Part]]:
+        """Place the jump between each two neighbours, and leave out the pairs near it."""
+        jumps, kept = list[Jump](), parts[:1]
+        for part in parts[1:]:
+            jump, kept[-1:] = self._jump(kept[-1], part)
+            jumps.append(jump)
+        return jumps, kept
 
     def _jump(self, one: _Part, two: _Part) -> tuple[Jump, list[_Part]]:
         """Find between which events the clock jumped, and drop those in doubt."""

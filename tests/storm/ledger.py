@@ -83,6 +83,7 @@ class Ledger:
         self._ended = True
         self.damaged: dict[str, tuple[str, Sums]] = {}
         self._moving: set[str] = set()
+        self._begun: set[str] = set()
         self.owed: set[str] = set()
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
@@ -131,6 +132,8 @@ class Ledger:
                 raise Wrong(note["wrong"], note["what"])
             if note.get("asked") == "again" or note.get("asks") == "again":
                 self.again.update(note["trials"])
+            if "asks" in note:
+                self._begun.add(note["asks"])
             if "damaged" in note:
                 self.damaged[note["damaged"]] = note["how"], {}
             if "spoilt" in note:
@@ -480,6 +483,8 @@ class Ledger:
             if not any(abs(datetime.fromisoformat(each).timestamp() - at_s) <= 1 for each in when):
                 raise Wrong("a log is true", f"has '{text}' at {when or 'no time'}")
         there = {request.number: request.kind for request in control.requests(store)}
+        # a kill may come between a request and its note
+        self.asked = {n: kind for n, kind in there.items() if kind in self._begun} | self.asked
         for number, kind in self.asked.items():
             if there.get(number) != kind:
                 raise Wrong("a log is true", f"request {number} ({kind}) is {there.get(number)}")
