@@ -84,6 +84,7 @@ class Ledger:
         self.damaged: dict[str, tuple[str, Sums]] = {}
         self._moving: set[str] = set()
         self._begun: set[str] = set()
+        self._waiting = False
         self.owed: set[str] = set()
         self.unfinished: dict[str, Sums] = {}
         self.counts: Counter[str] = Counter()
@@ -135,7 +136,8 @@ class Ledger:
             if "asks" in note:
                 self._begun.add(note["asks"])
             if "damaged" in note:
-                self.damaged[note["damaged"]] = note["how"], {}
+                before, _ = self.damaged.get(note["damaged"], ("", {}))
+                self.damaged[note["damaged"]] = "cut" if before == "cut" else note["how"], {}
             if "spoilt" in note:
                 self.spoilt.add(note["spoilt"])
             if "begins" in note:
@@ -367,7 +369,7 @@ class Ledger:
         self.unfinished = {name: self._sums(folder / name) for name in incoming}
         self.counts = Counter(name.rpartition(".")[0] for name in self.aside)
         self.owed = {name for name in incoming - {*self.trials} if _is_complete(folder / name)}
-        forgiven = any("again" in note.values() for note in notes)
+        forgiven = self._waiting or any("again" in note.values() for note in notes)
         places = [note["place"] for note in notes if "begins" in note]
         if places != sorted(places) and not forgiven:
             raise Wrong("trials are taken in the plan's order", f"{places}")
@@ -513,6 +515,7 @@ class Ledger:
         # a kill may have come between what was asked and its answer
         waiting = control.open_requests(Store.open(self._folder))
         half = {trial for each in waiting for trial in each.trials}
+        self._waiting = any(each.kind == "again" for each in waiting)
         if by_person - half != skipped - half:
             what = f"{sorted(by_person)} are skipped, asked and answered were {sorted(skipped)}"
             raise Wrong("requests are carried out", what)
