@@ -18,6 +18,7 @@ from sliplab import AlignmentRefused, InputError
 from sliplab.plugins.align.align import UNKNOWN
 from sliplab.plugins.align.clock_state import ClockState
 from sliplab.plugins.align.events import events_from
+from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.storage.streams import F64
 from tests.command_line import answer, here
 
@@ -440,3 +441,18 @@ def test_a_file_that_is_read_is_not_written_over(tmp_path: Path, name: str) -> N
 def test_what_is_no_signal_with_taps_is_named(wrong: Any) -> None:
     with pytest.raises(InputError, match=r"a pair of times and values of numbers|has no samples"):
         sliplab.align_taps(wrong, wrong)
+
+
+@pytest.mark.parametrize("seed", [3, 5, 11])
+def test_pairs_by_chance_behind_a_jump_are_no_stretch(seed: int) -> None:
+    """A jump by 39 ticks of a code and 30 us, with a jitter of 7 us."""
+    rng = np.random.default_rng(seed)
+    b = np.flatnonzero(code_bits(seed + 1, 4000)).astype(np.int64) * 10_000_000
+    a = b + 390_030_000 * (b > 20_000_000_000)
+    jittered = [each + np.rint(rng.normal(0, 7000, b.size)).astype(np.int64) for each in (a, b)]
+    found = sliplab.align(*jittered)
+    (jump,) = found.jumps
+    assert jump.size_ns == pytest.approx(-390_030_000, abs=10_000)
+    mapped = found.map(a)
+    assert np.abs(mapped.ns - b)[mapped.within].max() < 10_000
+    assert mapped.within.mean() > 0.9
