@@ -63,6 +63,8 @@ NAME = "storm"
 """Of the campaign."""
 NIGHT_S = 4 * 3600.0
 """Bound of a night of some trials, pauses of 12 hours apart."""
+LATE_S = 0.15
+"""Time after an alarm within which its motion may end before it is answered."""
 
 
 @dataclass(frozen=True)
@@ -461,7 +463,11 @@ def react(process: Process, step: dict[str, Any]) -> None:
     alarm, reflex = done["onsets"]["incipient"], done["reflex"]
     assert reflex is not None
     process.notes.add(reflex=reflex["done"], phase=reflex.get("phase"))
-    if alarm is not None and alarm["phase"] in ACTING and not reflex["done"]:
+    if alarm is None or alarm["phase"] not in ACTING or reflex["done"]:
+        return
+    # a motion that ends before the decision is made has nothing to cut short
+    window_s = (alarm["end_us"] - alarm["start_us"]) / 1e6
+    if (done["windows"] - alarm["window"]) * window_s > LATE_S:
         process.notes.add(wrong="an alarm in motion is answered", what=f"at {alarm['phase']}")
 
 
