@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.plugins.simulation.scene.events import MarkerSensor
+from sliplab.plugins.simulation.scene.optics import EventOptics
 from sliplab.rigs.devices.dvxplorer.fake_stream import (
     DvServer,
     events_header,
@@ -26,8 +28,6 @@ from sliplab.rigs.devices.dvxplorer.fake_stream import (
     triggers_packet,
 )
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
-from sliplab.rigs.scene.events import MarkerSensor
-from sliplab.rigs.scene.optics import EventOptics
 from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import I64, EventChunk

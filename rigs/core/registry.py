@@ -31,7 +31,6 @@ BUILT_IN = {
     "basler": "sliplab.rigs.devices.basler:DRIVER",
     "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
     "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
-    "mock": "sliplab.rigs.mock:DRIVER",
     "devices": "sliplab.rigs.real:DRIVER",
 }
 
