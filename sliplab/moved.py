@@ -33,6 +33,7 @@ MOVED = {
     "sliplab.rigs.mock": "sliplab.plugins.simulation",
     "sliplab.rigs.scene": "sliplab.plugins.simulation.scene",
     "sliplab.flows.scene_runs": "sliplab.plugins.simulation.scene_runs",
+    "sliplab.rigs.devices": "sliplab.plugins.devices",
     "sliplab.rigs.levels": "sliplab.plugins.simulation.levels",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }

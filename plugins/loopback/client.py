@@ -2,7 +2,7 @@
 
 In one process, drivers and fakes would wait for each other and share one interpreter, unlike on a
 real rig. Frames return through a second pipe, because pylon's emulated camera is in the drivers'
-process: `rigs.devices.basler.fake_live` substitutes them for its images.
+process: `plugins.devices.basler.fake_live` substitutes them for its images.
 """
 
 from __future__ import annotations

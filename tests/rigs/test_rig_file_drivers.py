@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
+from sliplab.plugins.devices.basler.frame_time import FrameStamping
 from sliplab.protocols import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.protocols.program import Move
 from sliplab.rigs.build import _check_grade
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.basler.frame_time import FrameStamping
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT

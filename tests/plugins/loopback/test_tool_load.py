@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.devices.ur.fake import Client
+from sliplab.plugins.devices.ur.fake_program import UrProgram
 from sliplab.plugins.loopback.tool_load import ToolLoad
 from sliplab.plugins.simulation.devices import build_mock
 from sliplab.plugins.simulation.force import MockForceSensor
@@ -15,8 +17,6 @@ from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.rigs.core.capabilities import Mounting, Pose
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.devices.ur.fake import Client
-from sliplab.rigs.devices.ur.fake_program import UrProgram
 from sliplab.storage.clockmap import ClockMap
 from tests.plugins.simulation.test_force import QUIET, go_to, move
 
