@@ -105,7 +105,7 @@ def _unknown(name: str, kind: type[Declaration]) -> str:
             broken.append(str(error))
     text = (
         "is a driver of no installed package: install the package that has it (`sliplab rigs "
-        f"--drivers` lists the installed ones), or choose one of {', '.join(names)}"
+        f"--drivers` lists the installed ones), or choose one of {', '.join(sorted(names))}"
     )
     return "; ".join([text + did_you_mean(name, names), *broken])
 

@@ -44,7 +44,7 @@ used as an input: trigger_line
 trigger_line
     timing.frames: exposure line | timing.frames | must be hardware trigger
     mock.frame_camera.level: tracks | mock.frame_camera.level | must be video
-    devices.arm.driver: kuka | devices.arm.driver | one of ur, abb
+    devices.arm.driver: kuka | devices.arm.driver | one of abb, abb_socket, ur
     devices.arm.egm_port: 6510 | devices.arm.egm_port | known here: driver, host
     devices.arm.limits: | devices.arm.limits | is missing
     devices.arm.limits.low_mm: [-20, 30, -70] | devices.arm.limits.low_mm | y is not below high_mm
