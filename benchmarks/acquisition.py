@@ -35,11 +35,11 @@ from benchmarks.basler_emulation import LossyDevice, show, write_frames
 from benchmarks.dvxplorer_server import DvxplorerServer, Packet
 from benchmarks.measure import SEED, Figures, queued_s, resident_mb
 from benchmarks.storage import noisy_frames
-from sliplab.rigs.devices.basler.driver import BaslerCamera, find_camera
-from sliplab.rigs.devices.basler.fake_live import emulate
-from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
-from sliplab.rigs.scene.randomness import generator
+from sliplab.plugins.devices.basler.driver import BaslerCamera, find_camera
+from sliplab.plugins.devices.basler.fake_live import emulate
+from sliplab.plugins.devices.basler.settings import BaslerSettings
+from sliplab.plugins.devices.dvxplorer.driver import DvxplorerCamera
+from sliplab.plugins.simulation.scene.randomness import generator
 from sliplab.storage.files import sync_file
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
 from sliplab.storage.trials.checksums import DATA, FRAMES, SPOOL

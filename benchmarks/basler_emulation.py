@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.plugins.simulation.scene.frames import FrameOptics, PlateView
 from sliplab.storage.streams import U8
 
 

@@ -16,11 +16,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sliplab.rigs.scene.contact import advance
-from sliplab.rigs.scene.friction import friction_knots
-from sliplab.rigs.scene.plate import advance_free
-from sliplab.rigs.scene.skin import Skin, SkinGeometry, make_skin
-from sliplab.rigs.scene.springs import Springs, Tips, make_springs, new_tips, track_width
+from sliplab.plugins.simulation.scene.contact import advance
+from sliplab.plugins.simulation.scene.friction import friction_knots
+from sliplab.plugins.simulation.scene.plate import advance_free
+from sliplab.plugins.simulation.scene.skin import Skin, SkinGeometry, make_skin
+from sliplab.plugins.simulation.scene.springs import (
+    Springs,
+    Tips,
+    make_springs,
+    new_tips,
+    track_width,
+)
 from sliplab.storage.streams import F64, I64
 
 DEPTH_MM, SECONDS = 2.8, 8.192

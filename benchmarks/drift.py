@@ -15,7 +15,8 @@ import numpy as np
 import yaml
 
 from sliplab.flows.running import orchestration
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.drift.document import FRICTION
 from sliplab.plugins.twin.drift.estimates import drifts
 from sliplab.plugins.twin.drift.flow import OneSpecimen
@@ -24,7 +25,6 @@ from sliplab.plugins.twin.statistics import of_names
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_specimen, simulated
 from sliplab.protocols import load_plan
 from sliplab.protocols.shipped import shipped_protocols
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store

@@ -18,16 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.rigs.devices.dvxplorer.fake_stream import (
+from sliplab.plugins.devices.dvxplorer.fake_stream import (
     DvServer,
     events_header,
     events_packet,
     triggers_header,
     triggers_packet,
 )
-from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
-from sliplab.rigs.scene.events import MarkerSensor
-from sliplab.rigs.scene.optics import EventOptics
+from sliplab.plugins.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
+from sliplab.plugins.simulation.scene.events import MarkerSensor
+from sliplab.plugins.simulation.scene.optics import EventOptics
 from sliplab.storage.process import leave_to_parent, out_of_reach
 from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import I64, EventChunk

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.rigs.scene.edges import CUT, level_at
-from sliplab.rigs.scene.events import EventOptics, Events
+from sliplab.plugins.simulation.scene.edges import CUT, level_at
+from sliplab.plugins.simulation.scene.events import EventOptics, Events
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import F64
 

@@ -36,13 +36,13 @@ from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.plugins.claims.document import ClaimState
 from sliplab.plugins.claims.evidence import TrialGrid
 from sliplab.plugins.claims.simulated import course
+from sliplab.plugins.simulation.physics import springs_of
+from sliplab.plugins.simulation.settings import MockSettings, scene_of, skin_of
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.yaml_file import parse_yaml, validate
-from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
 
 F64 = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[1]

@@ -16,12 +16,12 @@ import numpy as np
 
 from sliplab.analysis.force import PlateForces
 from sliplab.analysis.labels.force_onsets import force_onsets
-from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import scene_of, skin_of
+from sliplab.plugins.simulation.physics import springs_of
+from sliplab.plugins.simulation.scene.contact import advance
+from sliplab.plugins.simulation.scene.springs import Springs, Tips, new_tips, track_width
+from sliplab.plugins.simulation.settings import scene_of, skin_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
-from sliplab.rigs.scene.contact import advance
-from sliplab.rigs.scene.springs import Springs, Tips, new_tips, track_width
 from sliplab.storage.streams import F64
 
 DEPTHS_MM, SPEEDS_MM_S, SEEDS = (2.4, 2.8, 3.4), (0.6, 1.0, 1.6), 4

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sliplab.flows.scene_runs import changed, ideal
+from sliplab.plugins.simulation.scene_runs import changed, ideal
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol

@@ -22,9 +22,9 @@ import numpy as np
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from sliplab.analysis.labels.markers import MarkerTracks, track
 from sliplab.analysis.labels.plate_tracking import VideoTracks, track_video
-from sliplab.rigs.mock.settings import MockFrameCameraSettings, MockSettings
-from sliplab.rigs.mock.world import SimulatedWorld
-from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.plugins.simulation.scene.frames import FrameOptics, PlateView
+from sliplab.plugins.simulation.settings import MockFrameCameraSettings, MockSettings
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.storage.streams import F64, U8
 from sliplab.storage.trials.video import VideoWriter, read_frames
 

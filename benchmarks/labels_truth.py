@@ -29,14 +29,14 @@ from sliplab.analysis.labels.markers import FrameMarkers, MarkerTracker, stack_t
 from sliplab.analysis.labels.places import from_tracks
 from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge
 from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.flows.scene_runs import MOTION, changed, with_true_times
+from sliplab.plugins.simulation.scene_runs import MOTION, changed, with_true_times
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.faults import MarkerOccluded
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import Chunk, FrameChunk, Json
 

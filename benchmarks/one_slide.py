@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.scene.contact import advance
-from sliplab.rigs.scene.springs import Springs, new_tips, track_width
+from sliplab.plugins.simulation.scene.contact import advance
+from sliplab.plugins.simulation.scene.springs import Springs, new_tips, track_width
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -28,7 +28,7 @@ class SlideRun:
 
     Attributes:
         t_ns: row times after the start of the slide, (m,); the first is 0.
-        track: `rigs.scene.contact.record`'s rows, (m, track_width(n)).
+        track: `scene.contact.record`'s rows, (m, track_width(n)).
         loads: forces x, y and normal of each tip, N, (m, 3 n).
         began_s: start of the slide in the time of `track`'s slips, s.
     """

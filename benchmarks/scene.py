@@ -32,9 +32,9 @@ from benchmarks.one_slide import run_slide
 from benchmarks.scene_tradeoff.error import match_events
 from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
 from benchmarks.trials import open_session
-from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings, skin_of
-from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.plugins.simulation.physics import springs_of
+from sliplab.plugins.simulation.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.plugins.simulation.settings import MockSettings, skin_of
 from sliplab.storage.streams import F64, I64, EventChunk
 
 TRIALS = 30

@@ -10,9 +10,9 @@ from functools import cache
 import numpy as np
 
 from benchmarks.measure import SEED
+from sliplab.plugins.simulation.devices import MockDevices, build_mock
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.rigs.core.capabilities import Segment
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import F64, I64, EventChunk
 
 DEPTH_MM, SPEED_MM_S, LENGTH_MM = 2.8, 1.0, 15.0

@@ -52,7 +52,7 @@ def main() -> None:
 
         def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
             """As without it, but for the one module."""
-            if name != "sliplab.rigs.mock.arm":
+            if name != "sliplab.plugins.simulation.arm":
                 return None
             sys.meta_path.remove(self)
             found: Any = find_spec(name)

@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks.event_files import rivals
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import many_events
-from sliplab.rigs.scene.frames import FrameOptics, PlateView
-from sliplab.rigs.scene.randomness import generator
+from sliplab.plugins.simulation.scene.frames import FrameOptics, PlateView
+from sliplab.plugins.simulation.scene.randomness import generator
 from sliplab.storage.formats.aedat4 import Aedat4File
 from sliplab.storage.streams import U8, EventChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader

@@ -39,7 +39,8 @@ from matplotlib.figure import Figure
 from scipy.stats import kstest, kstwo
 from threadpoolctl import threadpool_limits
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import MockEventCameraSettings, scene_of
 from sliplab.plugins.twin.document import MisfitCheck
 from sliplab.plugins.twin.misfits import misfits
 from sliplab.plugins.twin.parameters import PARAMETERS, settings_of, value_of
@@ -50,7 +51,6 @@ from sliplab.plugins.twin.statistics import SlideStatistics, of_names, statistic
 from sliplab.plugins.twin.worlds import DrawnWorld, Prior, Slides
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.core import faults
-from sliplab.rigs.mock.settings import MockEventCameraSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import Papilla, scene_of, skin_of
 from sliplab.plugins.twin.effects import Effect, effects_of
 from sliplab.plugins.twin.needs.flow import WORLDS
 from sliplab.plugins.twin.needs.judging import Marked, Need, marked, marks, need
 from sliplab.plugins.twin.parameters import PARAMETERS, value_of
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.settings import Papilla, scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import Json

@@ -54,12 +54,12 @@ from sliplab.flows.other_rig import retake
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration
 from sliplab.flows.train import train
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.calibrate import calibrate_scene, request
 from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import read_json, write_json

@@ -18,11 +18,11 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from sliplab.plugins.simulation.devices import MockDevices, build_mock
+from sliplab.plugins.simulation.rig import simulated_rig
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.levels import with_level
-from sliplab.rigs.mock.rig import simulated_rig
+from sliplab.rigs.physics_levels import with_level
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink
 

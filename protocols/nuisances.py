@@ -6,7 +6,7 @@
         strength: {unit: percent, values: [50, 100, 200]}
       nuisances: {apply: $nuisance, strength: $strength}
 
-A simulated rig produces each by physics (`sliplab.rigs.mock.nuisances`). On a real rig the arm
+A simulated rig produces each by physics (plug-in `simulation`). On a real rig the arm
 makes its own motions, which are in the hold, and the operator is asked to make the rest.
 """
 

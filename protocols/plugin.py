@@ -123,10 +123,29 @@ class Plugins:
 @cache
 def plugins() -> Plugins:
     """Return the plug-ins that are installed; their declarations are imported."""
+    own = shipped()
+    points = sorted((each.name, each.value, package_of(each)) for each in entry_points(group=GROUP))
+    others = _declared(points)
+    return Plugins(  # another package cannot replace one that ships
+        {**own.found, **{k: v for k, v in others.found.items() if k not in own.found}},
+        {**others.packages, **own.packages},
+        own.faults + others.faults,
+    )
+
+
+@cache
+def shipped() -> Plugins:
+    """Return the plug-ins that ship. They are found by their folders, so a checkout is enough."""
+    names = sorted(each.name for each in iter_modules(import_module(GROUP).__path__))
+    return _declared([(name, f"{GROUP}.{name}:PLUGIN", "sliplab") for name in names])
+
+
+def _declared(places: list[tuple[str, str, str]]) -> Plugins:
+    """Import declarations, given names, places and distributions."""
     found: dict[str, Plugin] = {}
     packages: dict[str, str] = {}
     faults = []
-    for name, place, package in _places():
+    for name, place, package in places:
         try:
             plugin = import_foreign(place)
             if not isinstance(plugin, Plugin):
@@ -134,7 +153,7 @@ def plugins() -> Plugins:
         except PluginError as error:
             faults.append(f"the plug-in {name} cannot be used: {error}")
         else:
-            found.setdefault(name, plugin)  # another package cannot replace one that ships
+            found.setdefault(name, plugin)
             packages.setdefault(name, package)
     return Plugins(found, packages, tuple(faults))
 
@@ -142,14 +161,3 @@ def plugins() -> Plugins:
 def package_of(point: EntryPoint) -> str:
     """Return the distribution of an entry point, and its version."""
     return "" if point.dist is None else f"{point.dist.name} {point.dist.version}"
-
-
-def _places() -> list[tuple[str, str, str]]:
-    """Return names, places and distributions of plug-ins, first of those that ship.
-
-    Those are found by their folders, so a checkout is enough.
-    """
-    folders = iter_modules(import_module(GROUP).__path__)
-    shipped = [(each.name, f"{GROUP}.{each.name}:PLUGIN", "sliplab") for each in folders]
-    others = [(each.name, each.value, package_of(each)) for each in entry_points(group=GROUP)]
-    return sorted(shipped) + sorted(others)

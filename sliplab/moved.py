@@ -17,7 +17,7 @@ MOVED = {
     "sliplab.plugins.bench.registry": "sliplab.analysis.detectors.registry",
     "sliplab.protocols.conditions": "sliplab.protocols.model",
     "sliplab.flows.planning.schema": "sliplab.flows.planning.json_schemas",
-    "sliplab.rigs.mock.faults": "sliplab.rigs.mock.fault_book",
+    "sliplab.rigs.mock.faults": "sliplab.plugins.simulation.fault_book",
     "sliplab.rigs.mock.fault_settings": "sliplab.rigs.core.faults",
     "sliplab.rigs.mock.fault_kinds": "sliplab.rigs.core.faults",
     "sliplab.flows.server": "sliplab.plugins.web.server",
@@ -30,7 +30,11 @@ MOVED = {
     "sliplab.analysis.evaluation.classes": "sliplab.plugins.classes.evaluation",
     "sliplab.storage.schema.classes": "sliplab.plugins.classes.document",
     "sliplab.rigs.devices.settings": "sliplab.rigs.device_section",
-    "sliplab.rigs.levels": "sliplab.rigs.mock.levels",
+    "sliplab.rigs.mock": "sliplab.plugins.simulation",
+    "sliplab.rigs.scene": "sliplab.plugins.simulation.scene",
+    "sliplab.flows.scene_runs": "sliplab.plugins.simulation.scene_runs",
+    "sliplab.rigs.devices": "sliplab.plugins.devices",
+    "sliplab.rigs.levels": "sliplab.plugins.simulation.levels",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }
 """Old names of packages and modules, and what they are now."""

@@ -20,8 +20,8 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.sweeps.runner import Sweep, SweepTask, task_sweep
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
+from sliplab.plugins.simulation.settings import MockSettings, scene_of
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store
 

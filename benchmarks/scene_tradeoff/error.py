@@ -16,7 +16,7 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT, NO_SLIP
 from sliplab.analysis.windows.samples import consecutive_windows
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.flows.scene_runs import Onsets, SceneRun
+from sliplab.plugins.simulation.scene_runs import Onsets, SceneRun
 from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 

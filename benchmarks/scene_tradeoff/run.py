@@ -23,14 +23,14 @@ from benchmarks.scene_tradeoff.variants import (
     variants,
 )
 from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.flows import scene_runs
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.cluster import connected
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation import scene_runs
+from sliplab.plugins.simulation.levels import at_level, choose_level
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.levels import at_level, choose_level
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
 
@@ -90,7 +90,6 @@ def tradeoff_scene(
         else:
             done = each(running.compare_trial, jobs, done=lambda: bar.advance(compared))
         planned = choose_level(at_level(rig, "auto"), plan)
-        assert planned is not None
         result = {
             "simulated": True,
             "protocol": plan.protocol.name,

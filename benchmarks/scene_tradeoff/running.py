@@ -17,13 +17,13 @@ from benchmarks.scene_tradeoff.variants import (
     compare_variants,
     variants,
 )
-from sliplab.flows.scene_runs import SceneRun, changed, ideal, run, timed
+from sliplab.plugins.simulation.levels import HIGHEST, expected_onsets, slides_of
+from sliplab.plugins.simulation.scene.onsets import retraction_onsets
+from sliplab.plugins.simulation.scene_runs import SceneRun, changed, ideal, run, timed
+from sliplab.plugins.simulation.settings import scene_of, skin_of
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
-from sliplab.rigs.mock.levels import HIGHEST, expected_onsets, slides_of
-from sliplab.rigs.mock.settings import scene_of, skin_of
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.scene.onsets import retraction_onsets
 
 
 def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:

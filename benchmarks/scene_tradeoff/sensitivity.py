@@ -19,12 +19,13 @@ from benchmarks.scene_parameters import SceneOutcome
 from benchmarks.scene_tradeoff.variants import Variant
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.analysis.sweeps.runner import sample_trials
-from sliplab.flows.scene_runs import SceneRun, changed, run, with_true_times
+from sliplab.plugins.simulation.levels import HIGHEST, slides_of
+from sliplab.plugins.simulation.physics import springs_of
+from sliplab.plugins.simulation.scene_runs import SceneRun, changed, run, with_true_times
+from sliplab.plugins.simulation.settings import MockSettings, scene_of, skin_of
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
-from sliplab.rigs.mock.levels import HIGHEST, slides_of, with_level
-from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings, scene_of, skin_of
+from sliplab.rigs.physics_levels import with_level
 from sliplab.rigs.rig_file import RigFile
 
 CONTACT_TRIALS = 12

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from benchmarks.scene_tradeoff.error import SceneError, choose_by_windows, compare, mean_error
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
-from sliplab.flows.scene_runs import Onsets, SceneRun
+from sliplab.plugins.simulation.scene_runs import Onsets, SceneRun
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings

@@ -17,7 +17,7 @@ import numpy as np
 from sliplab.analysis.metrics.classification import CLASSES, NO_SLIP
 from sliplab.analysis.windows.samples import choose_windows
 from sliplab.analysis.windows.windows import window_totals
-from sliplab.flows.scene_runs import SceneRun
+from sliplab.plugins.simulation.scene_runs import SceneRun
 from sliplab.protocols.windows import SampleSettings, Windows
 
 PHASES = ("hold", "loading", "incipient", "gross")

@@ -19,7 +19,7 @@ from sliplab.protocols.detection import Detection
 from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.rigs.core.reacting import Reflex
-from sliplab.rigs.mock.levels import with_level
+from sliplab.rigs.physics_levels import with_level
 from sliplab.rigs.rig_file import ReflexSettings, RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
 
@@ -147,7 +147,7 @@ def make_detect_request(
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     chosen = choose_trial(plan, trial)
     return DetectRequest(
-        rig=(with_level(file, plan) if file.simulated else file).read_at_least(poll_s),
+        rig=with_level(file, plan).read_at_least(poll_s),
         source=source(plan.protocol.analysis),
         plan=plan,
         trial=chosen,

@@ -11,7 +11,7 @@ from sliplab.protocols import Plan
 from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from sliplab.rigs.mock.levels import LevelChoice, SlipExpected
+    from sliplab.rigs.physics_levels import LevelChoice, SlipExpected
     from sliplab.rigs.rig_file import RigFile
     from sliplab.storage.streams import Json
 
@@ -91,7 +91,7 @@ class PlannedScene:
     """A simulated rig's level of physics for a plan, and the slip to expect.
 
     Attributes:
-        expected: see `rigs.mock.levels.slip_expected`.
+        expected: see `rigs.physics_levels.SlipExpected`.
     """
 
     choice: LevelChoice
@@ -119,10 +119,12 @@ class PlannedScene:
 
 def scene_of(rig: RigFile, plan: Plan) -> PlannedScene | None:
     """Return the scene of a plan, None on a real rig."""
-    from sliplab.rigs.mock.levels import choose_level, slip_expected
+    from sliplab.rigs.physics_levels import levels_of
 
-    choice = choose_level(rig, plan)
-    return None if choice is None else PlannedScene(choice, slip_expected(rig, plan))
+    levels = levels_of(rig)
+    if levels is None:
+        return None
+    return PlannedScene(levels.choose(rig, plan), levels.expected(rig, plan))
 
 
 def plan_json(

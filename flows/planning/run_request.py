@@ -31,8 +31,7 @@ from sliplab.protocols.yaml_file import (
     read_text,
     without_secrets,
 )
-from sliplab.rigs.mock.levels import at_level, with_level
-from sliplab.rigs.mock.settings import scene_of
+from sliplab.rigs.physics_levels import levels_of, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.context import SKIN, LoggedContext
@@ -180,8 +179,9 @@ def make_request(
         begun = found if found.begun else None
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
-    if level and rig_file.simulated:
-        rig_file = at_level(rig_file, level)
+    levels = levels_of(rig_file)
+    if level and levels is not None:
+        rig_file = levels.at(rig_file, level)
     else:
         rig_file = with_level(rig_file, plan)
     run_request = RunRequest(
@@ -293,6 +293,7 @@ def _rig_changed(run_request: RunRequest, campaign: Campaign) -> str:
 def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
     """Write the campaign's description; the protocol's analysis and levels may have changed."""
     campaign = store.campaign(run_request.campaign)
+    levels = levels_of(run_request.rig)
     info: CampaignInfo = {
         "name": run_request.campaign,
         "protocol": run_request.plan.protocol.name,
@@ -301,7 +302,7 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
         "rig": run_request.rig.name,
         "rig_hash": rig_hash(run_request.rig_text),
         "simulated": run_request.rig.simulated,
-        "scene_level": scene_of(run_request.rig).scene.level if run_request.rig.simulated else None,
+        "scene_level": None if levels is None else levels.stated(run_request.rig),
         "enabled": list(run_request.enable),
     }
     file = run_request.plan.file

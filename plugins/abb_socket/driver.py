@@ -3,7 +3,7 @@
 The server's limits shape this driver. It has no stop command, so a path is sent in pieces of at
 most `segment_s` seconds, and a stop waits for the current piece. It answers nothing during a move,
 so poses are known only between pieces. It reports no time, so times are the host's. It reports no
-safety state, so a protective stop appears as a move without an answer. `rigs.devices.abb.driver`
+safety state, so a protective stop appears as a move without an answer. `plugins.devices.abb.driver`
 has none of these limits.
 """
 

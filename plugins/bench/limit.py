@@ -18,9 +18,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliplab.plugins.bench.scenes import SceneDraw, take
-from sliplab.rigs.mock.identity import Identity
-from sliplab.rigs.mock.world import SimulatedWorld
-from sliplab.rigs.scene.events import MarkerSensor
+from sliplab.plugins.simulation.identity import Identity
+from sliplab.plugins.simulation.scene.events import MarkerSensor
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.storage.streams import F64, I64
 
 STEP_NS = 1_000_000

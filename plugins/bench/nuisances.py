@@ -9,10 +9,10 @@ from decimal import Decimal
 
 import numpy as np
 
+from sliplab.plugins.simulation.nuisances import faults_of
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.protocols.nuisances import SHIPPED, TrialNuisances
 from sliplab.rigs.core.faults import AnyFault
-from sliplab.rigs.mock.nuisances import faults_of
-from sliplab.rigs.mock.settings import MockSettings
 
 SLIDE_S = 12.0
 """Nuisances go on for so long after the hold."""

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.detector import Scene, Slip
-from sliplab.flows.scene_runs import Memory, changed, with_true_times
 from sliplab.plugins.bench.definition import (
     DEFINITION,
     EFFECTS,
@@ -21,6 +20,11 @@ from sliplab.plugins.bench.definition import (
     Span,
 )
 from sliplab.plugins.bench.nuisances import NUISANCES, nuisance_faults
+from sliplab.plugins.simulation.devices import MockDevices, build_mock
+from sliplab.plugins.simulation.rig import simulated_rig
+from sliplab.plugins.simulation.scene_runs import Memory, changed, with_true_times
+from sliplab.plugins.simulation.settings import scene_of
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.plugins.twin.worlds import ZERO_MM, Prior, other_specimen
 from sliplab.protocols import Plan
 from sliplab.protocols.hashing import hash_integer
@@ -29,10 +33,6 @@ from sliplab.protocols.plan import make_plan
 from sliplab.rigs.core.capabilities import Truth
 from sliplab.rigs.core.faults import AnyFault
 from sliplab.rigs.core.rig import TrialRun
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.rig import simulated_rig
-from sliplab.rigs.mock.settings import scene_of
-from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import EventChunk

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.plugins.simulation.path import EVERY, ArmPath, Leg, TrueSurface, tremor_envelope
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.fake_motion import STILL, StraightMotion, StraightMove
-from sliplab.rigs.mock.path import EVERY, ArmPath, Leg, TrueSurface, tremor_envelope
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]

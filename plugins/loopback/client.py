@@ -2,7 +2,7 @@
 
 In one process, drivers and fakes would wait for each other and share one interpreter, unlike on a
 real rig. Frames return through a second pipe, because pylon's emulated camera is in the drivers'
-process: `rigs.devices.basler.fake_live` substitutes them for its images.
+process: `plugins.devices.basler.fake_live` substitutes them for its images.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from sliplab.plugins.loopback.device import STREAMS
+from sliplab.plugins.simulation.further_settings import FurtherEventCamera
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
@@ -26,8 +28,6 @@ from sliplab.rigs.core.driver import EventCameraDriver
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 from sliplab.rigs.core.library_process import PipeCalls
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.mock.further_settings import FurtherEventCamera
-from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import EventStream, Stream
 from sliplab.storage.process import leave_to_parent, out_of_reach, used_s

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.rigs.core.driver import EventCameraDriver, RigDriver, lazy
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.stream_settings import keyed_drivers
 
 if TYPE_CHECKING:
@@ -62,4 +62,5 @@ DRIVER = RigDriver(
     build=lazy("sliplab.plugins.loopback.rig:build_rig"),
     faults=_faults,
     builder=lazy("sliplab.plugins.loopback.rig:rig_builder"),
+    levels="sliplab.plugins.simulation.levels:LEVELS",
 )

@@ -7,10 +7,10 @@ from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 
 from sliplab.plugins.loopback.client import Loopback
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.rigs.build import ShouldStop, driven_rig, never
 from sliplab.rigs.core.driver import BuildRig
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 
 

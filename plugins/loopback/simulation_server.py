@@ -1,6 +1,6 @@
 """One simulated scene in real time, behind fakes that speak the devices' protocols.
 
-The fakes send the same data that the simulated devices of `rigs.mock` would return: the same world,
+The fakes send the data that the simulated devices of `simulation` would return: the same world,
 the same noise, the same named faults. Only the path to the host differs, so a trial is the same
 through either. The world lags slightly behind the host's monotonic clock, so that a controller's
 move never lies in the world's past.
@@ -21,6 +21,19 @@ import numpy.typing as npt
 from sliplab.plugins.loopback.arm_path import FakeArmPath
 from sliplab.plugins.loopback.device import STREAMS
 from sliplab.plugins.loopback.tool_load import ToolLoad
+from sliplab.plugins.simulation.clocks import trial_clocks
+from sliplab.plugins.simulation.devices import build_mock
+from sliplab.plugins.simulation.event_camera import MockEventCamera
+from sliplab.plugins.simulation.force import MockForceSensor
+from sliplab.plugins.simulation.frame_camera import MockFrameCamera
+from sliplab.plugins.simulation.further_settings import FurtherEventCamera
+from sliplab.plugins.simulation.identity import Identity
+from sliplab.plugins.simulation.operator import MockPlate, SimulatedOperator
+from sliplab.plugins.simulation.path import TrueSurface
+from sliplab.plugins.simulation.settings import MockEventCameraSettings, MockSettings
+from sliplab.plugins.simulation.sync import FreeRun, MockSyncBox
+from sliplab.plugins.simulation.truth import plate_course, truth_of, watch_plate
+from sliplab.plugins.simulation.world import SimulatedWorld, start_pose
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
@@ -38,19 +51,6 @@ from sliplab.rigs.core.faults import wired
 from sliplab.rigs.core.pulse_code import PULSE_NS, CodeBits
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.mock.clocks import trial_clocks
-from sliplab.rigs.mock.devices import build_mock
-from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.frame_camera import MockFrameCamera
-from sliplab.rigs.mock.further_settings import FurtherEventCamera
-from sliplab.rigs.mock.identity import Identity
-from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
-from sliplab.rigs.mock.path import TrueSurface
-from sliplab.rigs.mock.settings import MockEventCameraSettings, MockSettings
-from sliplab.rigs.mock.sync import FreeRun, MockSyncBox
-from sliplab.rigs.mock.truth import plate_course, truth_of, watch_plate
-from sliplab.rigs.mock.world import SimulatedWorld, start_pose
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
 
@@ -278,7 +278,7 @@ class SimulationServer:
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> Truth:
         """Return the ground truth of a trial, counted from these arm controller times.
 
-        See `rigs.mock.truth.truth_of`.
+        See `truth.truth_of`.
         """
         self.turn()
         hold_ns = None if hold_arm_ns is None else self._true_ns(hold_arm_ns)

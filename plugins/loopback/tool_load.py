@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.path import SENSOR
-from sliplab.rigs.mock.world import SimulatedWorld
+from sliplab.plugins.simulation.force import MockForceSensor
+from sliplab.plugins.simulation.path import SENSOR
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]

@@ -20,7 +20,8 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console, orchestration
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import Papilla, scene_of
 from sliplab.plugins.twin.contact_estimates import NOT_LOGGED, papillae, read_contact
 from sliplab.plugins.twin.contact_slips import find_slips
 from sliplab.plugins.twin.document import (
@@ -49,7 +50,6 @@ from sliplab.plugins.twin.worlds import (
     touch_section,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import Papilla, scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path, rig_yaml, shipped_rigs
 from sliplab.rigs.twin import ConditionRange, FittedValue, TwinRecord

@@ -2,7 +2,7 @@
 
 A tip in steady slip pulls with T = mu N. Its papilla is a bent column: with the bend b,
 N = k_n (d - 0.6 b^2 / h) and T = b (k_b - 1.2 N / h), and the lag is b + c T, c the compliance of
-shear and base (the potential of `rigs.scene.slip`; a beam's shortening and softening). Lags have
+shear and base (the potential of `scene.slip`; a beam's shortening and softening). Lags have
 no scale of force: they determine friction, and the ratio of the base's compliances to the skin's.
 Forces add the scale.
 """

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.parameters import settings_of
 from sliplab.plugins.twin.posterior import Posterior
 from sliplab.plugins.twin.worlds import touch_section
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_bytes, write_text

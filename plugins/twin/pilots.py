@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.scene_runs import Memory, changed, with_true_times
+from sliplab.plugins.simulation.levels import choose_level
+from sliplab.plugins.simulation.scene_runs import Memory, changed, with_true_times
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.contact_springs import Guess
 from sliplab.plugins.twin.pilot import (
     Forces,
@@ -25,8 +27,6 @@ from sliplab.plugins.twin.statistics import SlideStatistics, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import FORCE
-from sliplab.rigs.mock.levels import choose_level
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, WrenchChunk
 from sliplab.storage.trials.derived import Derived
@@ -138,7 +138,7 @@ def check_level(item: Collected) -> None:
     """
     plan = item.plan
     rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
-    choice = choose_level(rig, plan)
+    choice = choose_level(rig, plan) if rig.simulated else None
     if choice is not None and choice.name != LEVEL:
         raise StoreError(
             f"campaign '{item.name}': was simulated at level {choice.name}, without all physics "

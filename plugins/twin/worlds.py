@@ -11,7 +11,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sliplab.flows.running import console, orchestration
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.devices import build_mock
+from sliplab.plugins.simulation.rig import simulated_rig
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.contact_springs import Guess
 from sliplab.plugins.twin.parameters import (
     PARAMETERS,
@@ -27,9 +30,6 @@ from sliplab.plugins.twin.posterior import Bank
 from sliplab.plugins.twin.statistics import VERSION, SlideStatistics, of_names, statistics
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.mock.devices import build_mock
-from sliplab.rigs.mock.rig import simulated_rig
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived, make_key

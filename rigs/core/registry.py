@@ -17,23 +17,15 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TypeVar
 
-from sliplab.protocols.plugin import package_of, plugins
+from sliplab.protocols.plugin import Plugins, package_of, plugins, shipped
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import did_you_mean
 from sliplab.rigs.core.driver import Declaration
 
 DriverT = TypeVar("DriverT", bound=Declaration)
 GROUP = "sliplab.drivers"
-BUILT_IN = {
-    "ur": "sliplab.rigs.devices.ur:DRIVER",
-    "abb": "sliplab.rigs.devices.abb:DRIVER",
-    "dvxplorer": "sliplab.rigs.devices.dvxplorer:DRIVER",
-    "basler": "sliplab.rigs.devices.basler:DRIVER",
-    "sync_box": "sliplab.rigs.devices.sync_box:DRIVER",
-    "ur_wrench": "sliplab.rigs.devices.ur:WRENCH_DRIVER",
-    "mock": "sliplab.rigs.mock:DRIVER",
-    "devices": "sliplab.rigs.real:DRIVER",
-}
+REAL = "devices"
+"""The driver of real rigs, the only one in the core."""
 
 
 class DriverError(Exception):
@@ -54,10 +46,7 @@ class Listed:
 @cache
 def listed() -> dict[str, Listed]:
     """Return every installed driver by name, those that ship first."""
-    found = dict(_built_in())
-    for subject, plugin in plugins().found.items():
-        for name, place in plugin.drivers.items():
-            found.setdefault(name, Listed(name, place, plugins().packages[subject]))
+    found = {**_of(plugins()), **_shipped()}
     for point in sorted(
         entry_points(group=GROUP), key=lambda point: (point.name, package_of(point))
     ):
@@ -67,8 +56,16 @@ def listed() -> dict[str, Listed]:
 
 
 @cache
-def _built_in() -> dict[str, Listed]:
-    return {name: Listed(name, place, "sliplab") for name, place in BUILT_IN.items()}
+def _shipped() -> dict[str, Listed]:
+    return {REAL: Listed(REAL, "sliplab.rigs.real:DRIVER", "sliplab"), **_of(shipped())}
+
+
+def _of(known: Plugins) -> dict[str, Listed]:
+    found: dict[str, Listed] = {}
+    for subject, plugin in known.found.items():
+        for name, place in plugin.drivers.items():
+            found.setdefault(name, Listed(name, place, known.packages[subject]))
+    return found
 
 
 def taken() -> list[str]:
@@ -88,7 +85,7 @@ def find_driver(name: str, kind: type[DriverT]) -> DriverT:
     Raises:
         DriverError: no package provides it, it cannot be imported, or it is of another kind.
     """
-    known = _built_in().get(name) or listed().get(name)  # plug-ins are not looked for in vain
+    known = _shipped().get(name) or listed().get(name)  # other packages are not read in vain
     if known is None:
         raise DriverError(_unknown(name, kind))
     driver = load_driver(known)
@@ -108,7 +105,7 @@ def _unknown(name: str, kind: type[Declaration]) -> str:
             broken.append(str(error))
     text = (
         "is a driver of no installed package: install the package that has it (`sliplab rigs "
-        f"--drivers` lists the installed ones), or choose one of {', '.join(names)}"
+        f"--drivers` lists the installed ones), or choose one of {', '.join(sorted(names))}"
     )
     return "; ".join([text + did_you_mean(name, names), *broken])
 

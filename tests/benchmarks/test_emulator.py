@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.emulator import FRAME_NS, SOURCE, draw, emulate, find_emulator
-from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.plugins.simulation.scene.events import EventOptics, MarkerSensor
 
 OPTICS = EventOptics(width=160, height=120, noise_hz=0.0, hot_pixels=0, readout_hz=0.0)
 LAYOUT = np.array([[-2.5, 0.0], [2.0, 1.0]])

@@ -27,8 +27,8 @@ from benchmarks.twin_studies import (
 from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import Decided, OnsetReference
 from sliplab.analysis.evaluation.trials import EvaluatedTrials
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols import load_plan
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 

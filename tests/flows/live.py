@@ -16,7 +16,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.plugins.loopback.client import Loopback
 from sliplab.plugins.loopback.rig import loopback_rig
-from sliplab.rigs.mock.settings import scene_of
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT, SMALL

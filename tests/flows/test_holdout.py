@@ -18,8 +18,8 @@ from sliplab.flows import holdout
 from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, holdout_request, measure_holdout
 from sliplab.flows.label import label
 from sliplab.flows.report import report
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.studies.generalise import run as generalise
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.other_rig import other_request
-from sliplab.rigs.mock.settings import scene_of
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.storage.trials.store import Store
 from tests.flows.conftest import Ran
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from sliplab.plugins.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.device_section import DeviceSettings
-from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.discovery import ping_devices
 from tests.rigs.waiting import own_address
 

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
+from sliplab.plugins.devices.basler.frame_time import FrameStamping
 from sliplab.protocols import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.protocols.program import Move
 from sliplab.rigs.build import _check_grade
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.devices.basler.frame_time import FrameStamping
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT
@@ -44,7 +44,7 @@ used as an input: trigger_line
 trigger_line
     timing.frames: exposure line | timing.frames | must be hardware trigger
     mock.frame_camera.level: tracks | mock.frame_camera.level | must be video
-    devices.arm.driver: kuka | devices.arm.driver | one of ur, abb
+    devices.arm.driver: kuka | devices.arm.driver | one of abb, abb_socket, ur
     devices.arm.egm_port: 6510 | devices.arm.egm_port | known here: driver, host
     devices.arm.limits: | devices.arm.limits | is missing
     devices.arm.limits.low_mm: [-20, 30, -70] | devices.arm.limits.low_mm | y is not below high_mm

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols import InputError, load_plan
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.rigs.rig_inheritance import read_rig, rig_path, shipped_rigs
 from tests.conftest import ROOT

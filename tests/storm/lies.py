@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sliplab.plugins.simulation.arm import MockArm
+from sliplab.plugins.simulation.force import MockForceSensor
 from sliplab.rigs.core.capabilities import ArmState, Pose, Progress
-from sliplab.rigs.mock.arm import MockArm
-from sliplab.rigs.mock.force import MockForceSensor
 from sliplab.storage.streams import WrenchChunk
 
 OF_ARM = ("pose_nan", "pose_frozen", "pose_away", "pose_creep", "path_done")

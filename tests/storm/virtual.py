@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from sliplab.rigs.mock.world import SimulatedWorld
+from sliplab.plugins.simulation.world import SimulatedWorld
 
 BEGIN_S = 1_795_456_800.0
 """Time of the host when a story begins, seconds since 1970: the past, for caches have dates."""

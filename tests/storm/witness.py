@@ -12,6 +12,13 @@ import numpy as np
 
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.disk_space import RESERVE
+from sliplab.plugins.simulation.arm import MockArm
+from sliplab.plugins.simulation.event_camera import MockEventCamera
+from sliplab.plugins.simulation.force import MockForceSensor
+from sliplab.plugins.simulation.frame_camera import MockFrameCamera
+from sliplab.plugins.simulation.sync import MockSyncBox
+from sliplab.plugins.simulation.thermometer import MockThermometer
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core import reacting
@@ -20,13 +27,6 @@ from sliplab.rigs.core.guard import MEASURED_MM
 from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.mock.arm import MockArm
-from sliplab.rigs.mock.event_camera import MockEventCamera
-from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.frame_camera import MockFrameCamera
-from sliplab.rigs.mock.sync import MockSyncBox
-from sliplab.rigs.mock.thermometer import MockThermometer
-from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials import control
 from sliplab.storage.trials.context import SKIN, LoggedContext

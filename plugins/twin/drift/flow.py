@@ -18,6 +18,7 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import orchestration
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.drift.document import FRICTION, DriftFit, ParameterDrift, ReferenceFit
 from sliplab.plugins.twin.drift.estimates import FEWEST, Drift, drifts
 from sliplab.plugins.twin.parameters import PARAMETERS, SceneParameter, value_of
@@ -34,7 +35,6 @@ from sliplab.plugins.twin.worlds import (
 )
 from sliplab.protocols import Trial
 from sliplab.protocols.shown import plural
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError

@@ -14,7 +14,8 @@ from time import process_time
 
 import numpy as np
 
-from sliplab.flows.scene_runs import changed, timed
+from sliplab.plugins.simulation.scene_runs import changed, timed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.document import CheapestScene, EffectNeed
 from sliplab.plugins.twin.effects import NOT_SHOWN, Effect, effects_of, lacking, merged
 from sliplab.plugins.twin.needs.judging import (
@@ -29,7 +30,6 @@ from sliplab.plugins.twin.needs.judging import (
 )
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.worlds import DrawnWorld, everywhere
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
 from sliplab.storage.streams import F64, Json

@@ -9,7 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sliplab.analysis.calibration.charuco import Board, BoardError, Corners, find_corners, fit_lens
-from sliplab.rigs.scene.lens import VIEWS, BoardCamera, BoardPlace, BoardPrint, draw_board
+from sliplab.plugins.simulation.scene.lens import (
+    VIEWS,
+    BoardCamera,
+    BoardPlace,
+    BoardPrint,
+    draw_board,
+)
 
 Picture = NDArray[np.uint8]
 BOARD = Board()

@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.analysis.labels import event_tracking
 from sliplab.analysis.labels.event_tracking import Discs, EventTracks, find_discs, lost_slices
-from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.plugins.simulation.scene.events import EventOptics, MarkerSensor
 from sliplab.storage.streams import EventChunk
 
 SIZE = (640, 480)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sliplab.analysis.labels.plane import Perspective, plane_of
-from sliplab.rigs.scene.lens import Lens
+from sliplab.plugins.simulation.scene.lens import Lens
 
 SIDE = 832
 HALF = 3.0 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])

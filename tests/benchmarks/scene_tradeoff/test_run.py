@@ -18,7 +18,7 @@ from benchmarks.scene_tradeoff.running import closed_form
 from benchmarks.scene_tradeoff.variants import Variant
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.running import stopping
-from sliplab.flows.scene_runs import changed, ideal, run
+from sliplab.plugins.simulation.scene_runs import changed, ideal, run
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file

@@ -20,16 +20,16 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.preflight import check
 from sliplab.flows.planning.run_request import describe_campaign, make_request
+from sliplab.plugins.simulation.further_settings import Thermometer
+from sliplab.plugins.simulation.settings import MockSettings
+from sliplab.plugins.simulation.thermometer import MockThermometer
+from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.plugins.view import view
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.mock.further_settings import Thermometer
-from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.thermometer import MockThermometer
-from sliplab.rigs.mock.world import SimulatedWorld
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording

@@ -12,8 +12,8 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
+from sliplab.plugins.devices.abb.settings import AbbSettings
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

@@ -20,11 +20,11 @@ import pytest
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest
+from sliplab.plugins.devices.ur.driver import UrArm
+from sliplab.plugins.devices.ur.settings import SILENCE_S, WATCHDOG_HZ
 from sliplab.plugins.loopback.client import Loopback
 from sliplab.rigs.build import calibrated_arm
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
-from sliplab.rigs.devices.ur.driver import UrArm
-from sliplab.rigs.devices.ur.settings import SILENCE_S, WATCHDOG_HZ
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify

@@ -11,8 +11,8 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
 from sliplab.flows.planning.run_request import make_request
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT

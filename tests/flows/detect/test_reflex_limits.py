@@ -12,15 +12,15 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from sliplab.plugins.simulation.devices import MockDevices, build_mock
+from sliplab.plugins.simulation.path import SENSOR
+from sliplab.plugins.simulation.rig import simulated_rig
+from sliplab.plugins.simulation.settings import MockSettings, scene_of
+from sliplab.plugins.simulation.truth import COURSE, plate_course, watch_plate
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import Reaction, Reflex, SenseLost, SlipDetected, run_watched
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.path import SENSOR
-from sliplab.rigs.mock.rig import simulated_rig
-from sliplab.rigs.mock.settings import MockSettings, scene_of
-from sliplab.rigs.mock.truth import COURSE, plate_course, watch_plate
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import Chunk, NullSink, PoseChunk
 from tests.conftest import ROOT

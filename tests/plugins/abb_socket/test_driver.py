@@ -24,7 +24,7 @@ from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
-from tests.rigs.devices.conftest import closed, mm_after_kill, reconnect
+from tests.plugins.devices.conftest import closed, mm_after_kill, reconnect
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime

@@ -8,6 +8,12 @@ from sliplab.plugins.abb_socket import device as abb_socket
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.ati_net_ft import device as ati_net_ft
 from sliplab.plugins.ati_net_ft.settings import AtiNetFtSettings
+from sliplab.plugins.devices import abb, basler, dvxplorer, sync_box, ur
+from sliplab.plugins.devices.abb.settings import AbbSettings
+from sliplab.plugins.devices.basler.settings import BaslerSettings
+from sliplab.plugins.devices.dvxplorer.settings import DvxplorerSettings
+from sliplab.plugins.devices.sync_box.settings import SyncBoxSettings
+from sliplab.plugins.devices.ur.settings import UrSettings, UrWrenchSettings
 from sliplab.plugins.driver_kit.conformance import Case, cases
 from sliplab.plugins.driver_kit.rule import Bounds
 from sliplab.plugins.record import columns, lsl
@@ -17,12 +23,6 @@ from sliplab.plugins.uvc import device as uvc
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import listed, load_driver
-from sliplab.rigs.devices import abb, basler, dvxplorer, sync_box, ur
-from sliplab.rigs.devices.abb.settings import AbbSettings
-from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
-from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-from sliplab.rigs.devices.ur.settings import UrSettings, UrWrenchSettings
 from tests.plugins.driver_kit.trying import LIMITS, each_apart, free_udp_port, try_all
 from tests.rigs.waiting import own_address
 

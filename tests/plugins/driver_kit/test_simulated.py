@@ -18,6 +18,10 @@ from sliplab.plugins.driver_kit.bench import POLL_S, DeviceBench, check_methods
 from sliplab.plugins.driver_kit.rule import Bounds, NotTried
 from sliplab.plugins.driver_kit.sensor_benches import SyncBench
 from sliplab.plugins.driver_kit.stream_bench import BATCHES, StreamBench
+from sliplab.plugins.simulation.devices import MockDevices, build_mock
+from sliplab.plugins.simulation.settings import MockForceSensorSettings as ForceSettings
+from sliplab.plugins.simulation.settings import MockFrameCameraSettings as FrameSettings
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import (
     Arm,
@@ -29,10 +33,6 @@ from sliplab.rigs.core.capabilities import (
     SyncBox,
 )
 from sliplab.rigs.core.fakes import Kind
-from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.mock.settings import MockForceSensorSettings as ForceSettings
-from sliplab.rigs.mock.settings import MockFrameCameraSettings as FrameSettings
-from sliplab.rigs.mock.settings import MockSettings
 
 SETTINGS = MockSettings(
     frame_camera=FrameSettings(level="tracks"),

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplab.plugins.loopback.arm_path import FakeArmPath
+from sliplab.plugins.simulation.path import TOOL, TrueSurface
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
-from sliplab.rigs.mock.path import TOOL, TrueSurface
-from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap
 
 PLANE = TrueSurface.from_settings(MockSettings().scene.contact)

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
+from sliplab.plugins.devices.sync_box.driver import SerialSyncBox
+from sliplab.plugins.devices.sync_box.fake import FakeSyncBox
+from sliplab.plugins.devices.sync_box.settings import SyncBoxSettings
 from sliplab.plugins.loopback.simulation_server import SyncLevel
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.driver import PulseTrain
 from sliplab.rigs.core.pulse_code import PULSE_NS, code_bits
-from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
-from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.storage.clockmap import ClockMap
 from tests.rigs.waiting import until
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.devices.ur.fake import Client
+from sliplab.plugins.devices.ur.fake_program import UrProgram
 from sliplab.plugins.loopback.tool_load import ToolLoad
+from sliplab.plugins.simulation.devices import build_mock
+from sliplab.plugins.simulation.force import MockForceSensor
+from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.rigs.core.capabilities import Mounting, Pose
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.devices.ur.fake import Client
-from sliplab.rigs.devices.ur.fake_program import UrProgram
-from sliplab.rigs.mock.devices import build_mock
-from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap
-from tests.rigs.mock.test_force import QUIET, go_to, move
+from tests.plugins.simulation.test_force import QUIET, go_to, move
 
 OFFSET_S = 400.0
 CONTROLLER = ClockMap.line(0, round(OFFSET_S * 1e9), 0)

@@ -21,7 +21,8 @@ from sliplab.analysis.campaigns import Collected, collected
 from sliplab.flows.cli.app import command_line
 from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.planning.preflight import check
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin import calibrate, worlds
 from sliplab.plugins.twin.camera_estimates import NOISE_TREND
 from sliplab.plugins.twin.document import MisfitCheck, ParameterFit, TwinFit
@@ -34,7 +35,6 @@ from sliplab.plugins.twin.shown import SameTrials
 from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.plugins.twin.study import STUDY, finding
 from sliplab.protocols import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.derived import Derived

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.camera_estimates import NAMES, camera_estimates
 from sliplab.plugins.twin.event_times import (
     INTERVALS_US,
@@ -21,7 +22,6 @@ from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideEvents, SlideMot
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.plugins.twin.rims import CONTRAST, EDGE, HIDDEN, fit_rims
 from sliplab.protocols import load_plan
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import EventChunk
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.contact_estimates import (
     NOT_LOGGED,
     Papillae,
@@ -32,7 +33,6 @@ from sliplab.plugins.twin.contact_springs import (
 from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 
 ROOT = Path(__file__).parents[3]

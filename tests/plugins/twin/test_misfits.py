@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import lomax
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
 from sliplab.plugins.twin.camera_estimates import NAMES, NOISE_TREND
 from sliplab.plugins.twin.contact_estimates import read_contact
 from sliplab.plugins.twin.contact_springs import Guess, steady

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.devices import build_mock
+from sliplab.plugins.simulation.rig import simulated_rig
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.pilots import zero_error_mm
 from sliplab.plugins.twin.worlds import touch_depth_mm
-from sliplab.rigs.mock.devices import build_mock
-from sliplab.rigs.mock.rig import simulated_rig
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 

@@ -24,7 +24,7 @@ from sliplab.plugins.uvc.fake import VideoPipe
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import FrameCamera, RigError
 from sliplab.rigs.core.registry import find_driver
-from tests.rigs.devices.conftest import wait_until
+from tests.plugins.devices.conftest import wait_until
 
 __all__ = ["wait_until"]  # a fixture
 

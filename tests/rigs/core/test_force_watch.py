@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.simulation.force import MockForceSensor
+from sliplab.plugins.simulation.settings import MockSettings, scene_of
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import Mounting
 from sliplab.rigs.core.force_watch import POLL_S, ForceWatch
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
-from sliplab.rigs.mock.force import MockForceSensor
-from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import WrenchChunk
 

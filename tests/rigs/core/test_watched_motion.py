@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.simulation.settings import MockSettings, scene_of
 from sliplab.protocols.program import Dwell, Move, Position, Program, Twist
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.arm_settings import ArmLimits
@@ -31,7 +32,6 @@ from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
-from sliplab.rigs.mock.settings import MockSettings, scene_of
 from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 from tests.conftest import ROOT

@@ -16,6 +16,7 @@ from sliplab.analysis.sweeps.runner import SweepTask, task_sweep
 from sliplab.flows import other_rig
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.studies.generalise import results as generalisation
 from sliplab.plugins.studies.generalise.document import (
     GeneralisationResults,
@@ -26,7 +27,6 @@ from sliplab.plugins.studies.generalise.results import Generalisation, markdown
 from sliplab.plugins.studies.generalise.run import measure_generalisation, skin_task
 from sliplab.plugins.studies.generalise.section import RESULT
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.storage.files import json_text, read_json
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here

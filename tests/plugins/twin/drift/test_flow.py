@@ -20,6 +20,7 @@ import sliplab
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.flows.cli.app import command_line
 from sliplab.flows.planning.json_schemas import file_schema
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin import worlds
 from sliplab.plugins.twin.calibrate import fitted_rig
 from sliplab.plugins.twin.drift import flow as drift
@@ -28,7 +29,6 @@ from sliplab.plugins.twin.parameters import value_of
 from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.protocols import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import IMPORTED, Store, StoreError

@@ -17,6 +17,7 @@ from sliplab.flows.judge_network import judge_model
 from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import StudyOutcome
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.document import TwinGap
 from sliplab.plugins.twin.drawn_rigs import read_samples, samples_file, write_samples
 from sliplab.plugins.twin.gap import flow as gap
@@ -24,7 +25,6 @@ from sliplab.plugins.twin.gap.study import STUDY
 from sliplab.plugins.twin.posterior import ParameterPosterior, Posterior
 from sliplab.plugins.twin.worlds import touch_depth_mm
 from sliplab.protocols import InputError
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json

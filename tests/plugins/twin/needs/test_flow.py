@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 
 from benchmarks.scene_tradeoff.page import choice_pairs
-from sliplab.flows.scene_runs import changed
+from sliplab.plugins.simulation.scene_runs import changed
+from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.document import CheapestScene, EffectNeed
 from sliplab.plugins.twin.effects import EFFECTS
 from sliplab.plugins.twin.needs import flow as needs
 from sliplab.plugins.twin.needs.judging import Marks, Need, marks
 from sliplab.plugins.twin.worlds import DrawnWorld, Slides, guess_of, other_rig
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.mock.settings import scene_of
 from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.conftest import tiny, write
 

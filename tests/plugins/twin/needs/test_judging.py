@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from sliplab.plugins.simulation.settings import MockEventCameraSettings, MockSettings, SceneSettings
 from sliplab.plugins.twin.effects import EFFECTS, effects_of, lacking, merged
 from sliplab.plugins.twin.needs.judging import NEGLIGIBLE, Marked, crps, marked, marks, need
-from sliplab.rigs.mock.settings import MockEventCameraSettings, MockSettings, SceneSettings
 from sliplab.storage.streams import F64
 from tests.plugins.twin.test_shown import drawn, events
 

@@ -1,1 +1,0 @@
-"""Drivers of real devices, one folder each: settings, driver, and a fake with its protocol."""
