@@ -98,6 +98,8 @@ def rigs(
     else:
         rows = [[str(cell) for name, cell in item.items() if name in COLUMNS] for item in found]
         console.print_table("rigs", [*COLUMNS.values()], rows)
+    if files and not all(item["driver"] for item in found):
+        raise typer.Exit(exit_codes.WRONG_INPUT)
     if any(item["wrong"] for item in found):
         raise typer.Exit(exit_codes.FAILED)
 

@@ -403,6 +403,9 @@ def _of_text(text: str) -> Iterator[Source]:
         yield usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))
         return
     path = Path(text)
+    if not path.suffix and not path.exists():
+        right = "must be a rig file, a file of streams, lsl:NAME or usb:DEVICE@WIDTHxHEIGHT"
+        raise InputError("STREAMS", "", text, right)
     data = parse_yaml(read_text(path, "file of streams"), path)
     if "driver" in data or "extends" in data or "devices" in data:
         yield from _of_rig(path)

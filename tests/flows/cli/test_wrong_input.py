@@ -62,7 +62,7 @@ def test_a_wrong_rig_file(case: str, command: str, tmp_path: Path) -> None:
     path.write_text(ABB.replace(old, new, 1))
     if command == "rigs":
         done = here("rigs", path, "--json")
-        assert done.returncode == 1
+        assert done.returncode == 2
         line = json.loads(done.stdout)["rigs"][0]["answer"]
     else:
         more = ["--store", tmp_path / "store"] if command == "check" else []
