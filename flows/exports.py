@@ -105,11 +105,11 @@ def known_export(name: str) -> Export:
     from sliplab.storage.formats.known import format_names, known_format
 
     if name == "labels":
-        return Export("trials", _labels)
+        return Export("trials", _labels, frozenset({"campaign"}))
     if name == "samples":
-        return Export("trials", _samples, frozenset({"stream"}))
+        return Export("trials", _samples, frozenset({"campaign", "stream"}))
     if name in format_names() and known_format(name).export is not None:
-        return Export("trials", _trials, frozenset({"stream"}))
+        return Export("trials", _trials, frozenset({"campaign", "stream"}))
     places = plugins().declared("exports")
     if name not in places:
         raise InputError("--as", "", name, one_of(name, export_names()))
@@ -163,10 +163,15 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
     if part in campaigns:
         return opened, campaigns[part], sorted(campaigns[part].committed())
-    holders = opened.holders(part)
+    wanted = request.options.get("campaign") or [*campaigns]
+    if unknown := [each for each in wanted if each not in campaigns]:
+        text = f"is no campaign of {folder}; campaigns: {', '.join(campaigns)}"
+        raise InputError("--campaign", "", unknown[0], text)
+    holders = [each for each in opened.holders(part) if each.name in wanted]
     if len(holders) != 1:
         text = (
-            f"is in several campaigns of {folder}; name a trial or another campaign"
+            f"is in the campaigns {', '.join(each.name for each in holders)} of {folder}; "
+            "choose one by --campaign"
             if holders
             else f"is no campaign or committed trial of {folder}; campaigns: {', '.join(campaigns)}"
         )

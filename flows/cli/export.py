@@ -23,9 +23,7 @@ app = typer.Typer()
 class ExportOptions(StrictModel):
     """Options of the forms; each form takes some of them."""
 
-    campaign: list[str] = Field(
-        default=[], description="Store, model: only this campaign. Repeatable."
-    )
+    campaign: list[str] = Field(default=[], description="Only this campaign. Repeatable.")
     title: str | None = Field(
         default=None, description="Store: title; default: the campaigns' names."
     )

@@ -425,7 +425,7 @@ def carry(process: Process, step: dict[str, Any]) -> None:
         return
     name, out = names[step["trial"] % len(names)], stage.folder / "exported"
     shutil.rmtree(out, ignore_errors=True)
-    export(ExportRequest(str(stage.store), name, form, out))
+    export(ExportRequest(str(stage.store), name, form, out, {"campaign": [NAME]}))
     (file,) = out.glob(f"{name}.*")
     back = f"back{len(store.campaigns())}"
     import_data(file, stage.store, name=back, simulated=True)

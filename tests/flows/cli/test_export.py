@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,21 @@ def test_export_of_a_model_without_form_names_the_forms_of_models(tmp_path: Path
     forms = " ".join(done.stderr.split()).partition("--as: is needed: ")[2]
     assert forms.startswith("a trained network has the forms ")
     assert set(forms.rpartition(" forms ")[2].split(", ")) == {"card", "onnx"}
+
+
+def test_a_trial_of_several_campaigns_is_chosen_by_its_campaign(tmp_path: Path) -> None:
+    store = older_store(tmp_path / "store")
+    campaign = store / "campaigns" / "small"
+    trial = min(path.name for path in (campaign / "trials").iterdir())
+    shutil.copytree(campaign, campaign.with_name("copy"))
+    info = campaign.with_name("copy") / "campaign.json"
+    info.chmod(0o644)
+    info.write_text(info.read_text().replace('"small"', '"copy"', 1))
+    asked = ("export", store, trial, "--as", "dsec", "--output", tmp_path / "out")
+    done = here(*asked)
+    assert done.returncode == 2
+    said = " ".join(done.stderr.split())
+    assert f"{trial}: is in the campaigns copy, small of {store}; choose one by --campaign" in said
+    done = here(*asked, "--campaign", "other")
+    assert "--campaign = other: is no campaign of" in " ".join(done.stderr.split())
+    assert answer(*asked, "--campaign", "copy")["trials"] == 1
