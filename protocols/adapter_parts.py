@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from sliplab.protocols.file_pattern import parse_pattern, template_fields
 from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.shown import did_you_mean
 from sliplab.protocols.units import all_symbols, find_unit
 from sliplab.protocols.yaml_file import StrictModel, rule
 
@@ -169,6 +170,9 @@ class EventFiles(StrictModel):
         ):
             for key in keys:
                 if key in self.model_fields_set and not right:
+                    if near := did_you_mean(self.format, ("csv", "numpy", "counts")):
+                        text = f"is not of format {of}, and has {key}{near}"
+                        raise KeyedError(".format", self.format, text)
                     raise KeyedError(f".{key}", getattr(self, key), f"is for format: {of}")
         needed = (("axes", "step_ms") if counts else ("columns", "unit", "size_px")) * (
             tables or counts

@@ -173,6 +173,7 @@ time, x
     labels.onsets.unit: s | onsets.csv: row 2, first = '?300.*lies outside of
     labels.onsets: {ORDER} | onsets.csv: row 2, first = '?300.*lies before full
     streams.events.size_px: [8, 12] | up to column 15 .* 8 x 12
+    streams.events.format: csvv | streams.events.format = csvv.*did you mean 'csv'
     motion.end: 5 | motion.start = 0.1: to 5: lies outside
 """
 
