@@ -20,7 +20,6 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -128,7 +127,7 @@ def _events(runs: int, length_mm: float) -> Figures:
     silent = MarkerSensor(quiet, layout, SEED)
     fast = _first_second(loads_of_slide(settings, length_mm, FAST_MM_S))
     circuits = {
-        name: MarkerSensor(replace(quiet, **changes), layout, SEED)
+        name: MarkerSensor(quiet.model_copy(update=changes), layout, SEED)
         for name, changes in CIRCUITS.items()
     }
     counts: dict[str, int] = {}

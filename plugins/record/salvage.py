@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sliplab.plugins.record.campaign import FORMAT
 from sliplab.plugins.record.trial_record import BegunTrial, make_record
-from sliplab.storage.files import sweep_temporary, write_json_aside
+from sliplab.storage.files import sweep_temporary, sync_folder, write_json_aside
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.trial import Lost, Provenance
 from sliplab.storage.trials.checksums import PROVENANCE, RECORD
@@ -70,4 +70,5 @@ def _salvage(folder: Path) -> None:
     record = make_record(folder, begun, end_ns, lost=lost)
     provenance = Provenance(started=begun.started, operator=begun.operator)
     write_json_aside(folder / PROVENANCE, provenance.to_json())
+    sync_folder(folder)  # as when a trial is committed
     write_json_aside(folder / RECORD, record.to_json())

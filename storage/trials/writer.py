@@ -202,6 +202,7 @@ class TrialWriter:
         for name in data_files(self.folder):
             sync_file(self.folder / name)
         write_json_aside(self.folder / PROVENANCE, provenance.to_json())
+        sync_folder(self.folder)  # a record on the disk says that all the rest is there
         write_json_aside(self.folder / RECORD, record.to_json())
         drop_journal(self.folder)
         finish_folder(self.folder, cause)

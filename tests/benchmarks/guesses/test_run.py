@@ -196,4 +196,5 @@ def test_a_command_shows_them(store: Store) -> None:
     assert "Sensitivity to assumed scene parameters" in page
     assert "contrast of the markers" in page
     tables = sorted(path.name for path in Path(reported["page"]).parent.glob("tables/*.csv"))
-    assert tables == ["guesses.settings.csv", "guesses.settings.trials.csv"]
+    parts = ("", ".experiments", ".experiments.latency_ms", ".trials")
+    assert tables == [f"guesses.settings{part}.csv" for part in parts]
