@@ -80,11 +80,8 @@ def _follow(child: int, reader: int, kill_after_s: float | None) -> str:
     try:
         while True:
             ready, _, _ = select.select([reader], [], [], limit)
-            if (
-                not ready
-                and kill_after_s is None
-                and (more := _waited_s(child) - waited) > 0.01 * LIMIT_S
-            ):
+            more = _waited_s(child) - waited
+            if not ready and kill_after_s is None and more > 0.01 * LIMIT_S:
                 waited, limit = waited + more, more
             elif not ready:
                 os.kill(child, signal.SIGKILL)
