@@ -112,7 +112,7 @@ def _list_drivers(as_json: bool) -> None:
     from sliplab.rigs.core.registry import DriverError, listed, load_driver, taken
 
     found, wrong = [], taken()
-    for item in listed().values():
+    for item in sorted(listed().values(), key=lambda item: item.name):
         try:
             driver = load_driver(item)
         except DriverError as error:
