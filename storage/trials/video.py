@@ -31,6 +31,9 @@ else:
 CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
 _AT_ONCE = {"cluster_time_limit": "1", "flush_packets": "1"}
 """A cluster a frame: Matroska's writer holds a cluster back until the next one begins."""
+_INDEXED = 32
+"""Of so many frames of a video that is written for hours one is in Matroska's index, which its
+writer keeps in memory: it takes the frames that are marked as key frames."""
 _QUEUE_FRAMES = 32
 _PUT_TIMEOUT_S = 60.0
 
@@ -61,6 +64,7 @@ class VideoWriter:
         self.width, self.height = width, height
         self.frames = 0
         self._time_base = Fraction(1, rate_hz)
+        self._indexed = _INDEXED if guarded else 1
         options = {"fflags": "+bitexact"} | (_AT_ONCE if guarded else {})
         self._container = av.open(video_url(path), "w", format="matroska", options=options)
         self._stream = self._container.add_stream("ffv1", rate=rate_hz, options=CODEC_OPTIONS)
@@ -145,6 +149,7 @@ class VideoWriter:
                         self._turn.wait()
                     for packet in packets if self._error is None else ():
                         packet.stream = self._stream
+                        packet.is_keyframe = index % self._indexed == 0
                         self._container.mux(packet)
                     self._muxed += 1
                     self._turn.notify_all()
@@ -212,7 +217,8 @@ def read_frame(path: Path, index: int) -> U8:
 class FrameReader:
     """One frame after another in any order, from a video that stays open; a context manager.
 
-    Every frame is a key frame, so a frame costs a seek and its own decoding. One thread at a time.
+    Frames are coded independently, so one costs a seek, the packets from the last frame in the
+    index on, and its own decoding. One thread at a time.
     """
 
     def __init__(self, path: Path) -> None:
@@ -230,11 +236,11 @@ class FrameReader:
         step = 1 / (self._stream.average_rate * self._stream.time_base)  # ticks a frame
         if index >= 0:
             self._container.seek(round(index * step), stream=self._stream)
-            for frame in self._container.decode(self._stream):
-                number = round(frame.pts / step)
-                if number == index:
-                    return frame.to_ndarray(format="gray")  # type: ignore[no-any-return]
-                if number > index:
+            for packet in self._container.demux(self._stream):
+                number = index if packet.pts is None else round(packet.pts / step)
+                if number == index and packet.size:
+                    return next(iter(packet.decode())).to_ndarray(format="gray")  # type: ignore[no-any-return]
+                if number >= index:
                     break
         raise IndexError(f"{self.path}: has no frame {index}")
 

@@ -120,10 +120,11 @@ def test_no_frames_are_no_file(tmp_path: Path) -> None:
     assert not (tmp_path / "v.mkv").exists()
 
 
+@pytest.mark.parametrize("guarded", [False, True])
 @pytest.mark.parametrize("rate_hz", [30, 100, 144])
-def test_frames_are_found_in_any_order(tmp_path: Path, rate_hz: int) -> None:
+def test_frames_are_found_in_any_order(tmp_path: Path, rate_hz: int, guarded: bool) -> None:
     wanted = frames(40).images
-    writer = VideoWriter(tmp_path / "v.mkv", *FRAME, rate_hz)
+    writer = VideoWriter(tmp_path / "v.mkv", *FRAME, rate_hz, guarded=guarded)
     writer.write(wanted)
     writer.close()
     with FrameReader(tmp_path / "v.mkv") as reader:
