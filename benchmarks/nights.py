@@ -293,10 +293,10 @@ def measure(folder: Path, minutes: int, open_min: int, closed_min: int, browser:
         port = stack.enter_context(receiver.running())
         child = stack.enter_context(serving(folder, write_files(folder, plan, port)))
         home = folder / "store" / ".prefect"
-        operator, reader = (
-            (home / f"{r}-link").read_text().strip() for r in ("operator", "reader")
-        )
+        links = [home / f"{role}-link" for role in ("operator", "reader")]
         # the page's program starts beside the service
+        wait_for(lambda: all(link.exists() for link in links))
+        operator, reader = (link.read_text().strip() for link in links)
         wait_for(lambda: _answers(reader))
         pictures = stack.enter_context(watching(reader))
         if browser:
