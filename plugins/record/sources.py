@@ -403,7 +403,7 @@ def _of_text(text: str) -> Iterator[Source]:
         yield usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))
         return
     path = Path(text)
-    if not path.suffix and not path.exists():
+    if path.name == text and not path.suffix and not path.exists():
         right = "must be a rig file, a file of streams, lsl:NAME or usb:DEVICE@WIDTHxHEIGHT"
         raise InputError("STREAMS", "", text, right)
     data = parse_yaml(read_text(path, "file of streams"), path)

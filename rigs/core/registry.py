@@ -24,8 +24,11 @@ from sliplab.rigs.core.driver import Declaration
 
 DriverT = TypeVar("DriverT", bound=Declaration)
 GROUP = "sliplab.drivers"
-REAL = "devices"
-"""The driver of real rigs, the only one in the core."""
+AT_HAND = {
+    "devices": "sliplab.rigs.real:DRIVER",
+    "mock": "sliplab.plugins.simulation.device:DRIVER",
+}
+"""Drivers of rigs that are found without reading the declarations of all plug-ins."""
 
 
 class DriverError(Exception):
@@ -56,8 +59,13 @@ def listed() -> dict[str, Listed]:
 
 
 @cache
+def _at_hand() -> dict[str, Listed]:
+    return {name: Listed(name, place, "sliplab") for name, place in AT_HAND.items()}
+
+
+@cache
 def _shipped() -> dict[str, Listed]:
-    return {REAL: Listed(REAL, "sliplab.rigs.real:DRIVER", "sliplab"), **_of(shipped())}
+    return {**_at_hand(), **_of(shipped())}
 
 
 def _of(known: Plugins) -> dict[str, Listed]:
@@ -85,7 +93,7 @@ def find_driver(name: str, kind: type[DriverT]) -> DriverT:
     Raises:
         DriverError: no package provides it, it cannot be imported, or it is of another kind.
     """
-    known = _shipped().get(name) or listed().get(name)  # other packages are not read in vain
+    known = _at_hand().get(name) or _shipped().get(name) or listed().get(name)
     if known is None:
         raise DriverError(_unknown(name, kind))
     driver = load_driver(known)

@@ -82,7 +82,7 @@ def checksums(folder: Path) -> dict[str, str]:
 def study_of(store: Path) -> dict[str, Any]:
     """Return the summary and the text of the report of a studied store, and for which processor.
 
-    Numbers have six digits, which is what rounding in another order leaves.
+    Numbers have six digits.
     """
     import torch
 
@@ -94,20 +94,28 @@ def study_of(store: Path) -> dict[str, Any]:
     page = re.sub(r"(?s)<style>.*?</style>|<svg.*?</svg>|<[^>]*>", " ", page)
     page, *_ = page.split("wall time (s)")  # and versions
     page = re.sub(r"\s*\n\s*", "\n", page).strip()
-    rounded = _six_digits(neutral(summary, store))
+    rounded = six_digits(neutral(summary, store))
     return {
-        "processor": torch.backends.cpu.get_cpu_capability(),
+        "processor": f"{_vendor()} {torch.backends.cpu.get_cpu_capability()}",
         "summary": {name: _short(each) for name, each in rounded.items()},
         "page": neutral(page, store).splitlines(),
     }
 
 
-def _six_digits(value: Any) -> Any:
+def _vendor() -> str:
+    """Return who made the processor: others sum in another order, even with the same commands."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("vendor_id")]
+    return named[0] if named else "unknown"
+
+
+def six_digits(value: Any) -> Any:
+    """Round numbers to what summing in another order leaves."""
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, dict):
-        return {name: _six_digits(each) for name, each in value.items()}
-    return [_six_digits(each) for each in value] if isinstance(value, list) else value
+        return {name: six_digits(each) for name, each in value.items()}
+    return [six_digits(each) for each in value] if isinstance(value, list) else value
 
 
 def neutral(value: Any, folder: Path) -> Any:

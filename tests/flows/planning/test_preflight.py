@@ -98,7 +98,7 @@ def test_rigs_lists_what_ships_and_says_what_is_wrong_with_a_file(tmp_path: Path
     broken = tmp_path / "broken.yaml"
     broken.write_text("extends: " + str(ROOT / "rigs" / "ur5.yaml") + "\ndriver: mock\n")
     done = CliRunner().invoke(app, ["rigs", str(broken), "--json"])
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert "needed by driver: mock" in json.loads(done.stdout)["rigs"][0]["answer"]
 
 
