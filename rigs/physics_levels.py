@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.plugins import import_foreign
 from sliplab.rigs.core.driver import RigDriver
 from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.rig_file import RigFile
@@ -57,11 +56,9 @@ class PhysicsLevels:
 
 def levels_of(rig: RigFile) -> PhysicsLevels | None:
     """Return what chooses the physics of a rig; None on a real one."""
-    place = find_driver(rig.driver, RigDriver).levels
-    if place is None:
-        return None
-    found: PhysicsLevels = import_foreign(place)
-    return found
+    make = find_driver(rig.driver, RigDriver).levels
+    levels: PhysicsLevels | None = None if make is None else make()
+    return levels
 
 
 def with_level(rig: RigFile, plan: Plan) -> RigFile:

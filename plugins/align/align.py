@@ -473,12 +473,12 @@ class _Fit:
 
     def _finished(self, parts: list[_Part], by: str) -> Alignment:
         least = MIN_EVENTS // 2 if by == "pattern" else MIN_KNOWN
-        jumps, kept = self._jumps(parts)
-        while thin := [k for k, part in enumerate(kept) if part.run.a.size < least]:
+        jumps, trimmed = self._jumps(parts)
+        while thin := [k for k, part in enumerate(trimmed) if part.run.a.size < least]:
             # what the jumps on both sides leave so little of was paired by chance
             parts = [part for k, part in enumerate(parts) if k != thin[0]]
-            jumps, kept = self._jumps(parts)
-        parts = kept
+            jumps, trimmed = self._jumps(parts)
+        parts = trimmed
         stretches = []
         for k, part in enumerate(parts):
             lower = self._open_end(part, False) if k == 0 else None
@@ -575,11 +575,11 @@ class _Fit:
 
     def _jumps(self, parts: list[_Part]) -> tuple[list[Jump], list[_Part]]:
         """Place the jump between each two neighbours, and leave out the pairs near it."""
-        jumps, kept = list[Jump](), parts[:1]
+        jumps, trimmed = list[Jump](), parts[:1]
         for part in parts[1:]:
-            jump, kept[-1:] = self._jump(kept[-1], part)
+            jump, trimmed[-1:] = self._jump(trimmed[-1], part)
             jumps.append(jump)
-        return jumps, kept
+        return jumps, trimmed
 
     def _jump(self, one: _Part, two: _Part) -> tuple[Jump, list[_Part]]:
         """Find between which events the clock jumped, and drop those in doubt."""

@@ -62,5 +62,5 @@ DRIVER = RigDriver(
     build=lazy("sliplab.plugins.loopback.rig:build_rig"),
     faults=_faults,
     builder=lazy("sliplab.plugins.loopback.rig:rig_builder"),
-    levels="sliplab.plugins.simulation.levels:LEVELS",
+    levels=lazy("sliplab.plugins.simulation.levels:physics_levels"),
 )

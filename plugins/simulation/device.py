@@ -16,7 +16,7 @@ DRIVER = RigDriver(
     sections=("mock",),
     settings=MockSettings,
     build=lazy("sliplab.plugins.simulation.rig:build_rig"),
-    levels="sliplab.plugins.simulation.levels:LEVELS",
+    levels=lazy("sliplab.plugins.simulation.levels:physics_levels"),
     streams={
         "events": FurtherEventCamera,
         "frames": FurtherFrameCamera,

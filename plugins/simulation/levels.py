@@ -172,5 +172,6 @@ def _stated(rig: RigFile) -> str:
     return scene_of(rig).scene.level
 
 
-LEVELS = PhysicsLevels(choose_level, at_level, _stated, slip_expected)
-"""What the driver's declaration names."""
+def physics_levels() -> PhysicsLevels:
+    """Return what the drivers of simulated rigs declare."""
+    return PhysicsLevels(choose_level, at_level, _stated, slip_expected)

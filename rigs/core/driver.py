@@ -93,8 +93,8 @@ class RigDriver(Declaration):
     what takes long to start; it ends with the block."""
     streams: Mapping[str, type[SimulatedStream]] = field(default_factory=dict)
     """Models of simulated further devices, by the kinds of their streams."""
-    levels: str | None = None
-    """``module:object`` of its `rigs.physics_levels.PhysicsLevels`, for a simulated scene."""
+    levels: Callable[[], Any] | None = None
+    """Return its `rigs.physics_levels.PhysicsLevels`; None: it simulates no scene."""
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def live(
         kill_after_s: when it is killed from outside.
 
     Raises:
-        TimeoutError: it neither ended nor said anything for `LIMIT_S`.
+        TimeoutError: it neither ended nor wrote anything for `LIMIT_S`.
     """
     reader, writer = os.pipe()
     child = os.fork()

@@ -80,12 +80,10 @@ def checksums(folder: Path) -> dict[str, str]:
 
 
 def study_of(store: Path) -> dict[str, Any]:
-    """Return the summary and the text of the report of a studied store, and for which processor.
+    """Return the summary and the text of the report of a studied store.
 
     Numbers have six digits.
     """
-    import torch
-
     report = report_folder(Store.open(store))
     summary = read_json(report / "summary.json")
     for name in ("timing_s", "versions"):
@@ -94,28 +92,29 @@ def study_of(store: Path) -> dict[str, Any]:
     page = re.sub(r"(?s)<style>.*?</style>|<svg.*?</svg>|<[^>]*>", " ", page)
     page, *_ = page.split("wall time (s)")  # and versions
     page = re.sub(r"\s*\n\s*", "\n", page).strip()
-    rounded = six_digits(neutral(summary, store))
+    rounded = rounded_to(6, neutral(summary, store))
     return {
-        "processor": f"{_vendor()} {torch.backends.cpu.get_cpu_capability()}",
         "summary": {name: _short(each) for name, each in rounded.items()},
         "page": neutral(page, store).splitlines(),
     }
 
 
-def _vendor() -> str:
-    """Return who made the processor: others sum in another order, even with the same commands."""
+def processor() -> str:
+    """Return the processor's maker and commands: each trains another network."""
+    import torch
+
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("vendor_id")]
-    return named[0] if named else "unknown"
+    return f"{named[0] if named else 'unknown'}-{torch.backends.cpu.get_cpu_capability()}"
 
 
-def six_digits(value: Any) -> Any:
+def rounded_to(digits: int, value: Any) -> Any:
     """Round numbers to what summing in another order leaves."""
     if isinstance(value, float):
-        return float(f"{value:.6g}")
+        return float(f"{value:.{digits}g}")
     if isinstance(value, dict):
-        return {name: six_digits(each) for name, each in value.items()}
-    return [six_digits(each) for each in value] if isinstance(value, list) else value
+        return {name: rounded_to(digits, each) for name, each in value.items()}
+    return [rounded_to(digits, each) for each in value] if isinstance(value, list) else value
 
 
 def neutral(value: Any, folder: Path) -> Any:

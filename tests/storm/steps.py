@@ -44,6 +44,7 @@ from sliplab.protocols.program import ACTING, Move, Position
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.guard import GuardError
+from sliplab.rigs.core.host_clock import STEP_S
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.rigs.rig_file import rig_hash
 from sliplab.storage.errors import StoreError
@@ -194,8 +195,9 @@ def night(process: Process, step: dict[str, Any]) -> None:
     request = stage.request(step.get("faults", []), step.get("most"), until)
     planned_s = sum(request.plan.seconds(trial) for trial in request.plan)
     host.most_s = NIGHT_S + 10 * planned_s + 10 * supervising.PAUSE_LIMIT_S
-    # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces
-    supervising.POLL_S, force_watch.POLL_S = 300.0, 0.2
+    # what costs most is done less often: looking at a pause of 12 hours, and at simulated forces,
+    # though not so rarely that `StallTimer` leaves time out
+    supervising.POLL_S, force_watch.POLL_S = 300.0, STEP_S
     disturbed = any({"lie", "suspend"} & event.keys() for event in step.get("events", ()))
     witness = Witness(request.rig, host, notes, calm=not (step.get("faults") or disturbed))
     witness.install()

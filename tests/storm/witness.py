@@ -40,9 +40,8 @@ SLACK_S = 0.3
 """Beyond one poll, until a fault that the poses show has stopped the arm."""
 STUCK_S, STUCK_MM = 3.0, 0.5
 """Time, and motion at the commanded speed, until a pose that does not change stops the arm."""
-SILENT_S = 0.9
-"""Until a force sensor that does not answer has stopped the arm: `steps.night` reads it every
-0.2 s, of which `StallTimer` counts 0.1."""
+SILENT_S = 0.5
+"""Until a force sensor that does not answer has stopped the arm."""
 RATES_HZ = {"frames/t": 100.0, "poses/t": 500.0}
 """Rows a second while streams run, of those that nobody changes."""
 FORCE_SHARE = 1.1
