@@ -25,7 +25,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.shown import did_you_mean
+from sliplab.protocols.shown import one_of
 from sliplab.protocols.timing import StreamGrade, StreamTiming
 from sliplab.protocols.yaml_file import ChosenModel, StrictModel, rule
 from sliplab.rigs.core.device_settings import DriverSettings, FrameCameraSettings
@@ -219,11 +219,11 @@ class _ByKind(ChosenModel):
     def choose(self, value: dict[str, Any]) -> type[Stream]:
         """Return the model of the kind that `value` names."""
         kind = value.get("kind")
-        if kind not in KINDS and kind in {driver.sends for driver in drivers(SensorDriver)}:
+        sent = {driver.sends for driver in drivers(SensorDriver)} if kind not in KINDS else set()
+        if kind in sent:
             return SensorStream
         if not isinstance(kind, str) or kind not in KINDS:
-            hint = did_you_mean(str(kind), KINDS) if kind is not None else ""
-            raise KeyedError(".kind", kind, f"must be one of {', '.join(KINDS)}{hint}")
+            raise KeyedError(".kind", kind, one_of(kind, [*KINDS, *sorted(sent - {*KINDS})]))
         return KINDS[kind]
 
     def __get_pydantic_json_schema__(

@@ -371,7 +371,8 @@ class _Fit:
             if events.column and step > _LONG_NS:
                 column = f"{events.name}, {events.column}"
                 units.append(f"{column}: events come {step / 1e9:.3g} s apart: is the unit right?")
-        found = ["or give an approximate offset"] if reason == "ambiguous" else []
+        known = reason != "ambiguous" or self.offset_s is not None
+        found = [] if known else ["or give an approximate offset"]
         for events, pieces in ((self.a, self.pieces_a), (self.b, self.pieces_b)):
             if len(pieces) > 2:
                 found.append(str(_not_in_order(events, pieces)))

@@ -156,10 +156,11 @@ def _pairs(result: dict[str, Any]) -> dict[str, Any]:
             "rate": f"{least:+.1f} to {most:+.1f} ppm",
             **written,
         }
+    pairs = sum(part["events"] for part in result["stretches"])
     shown: dict[str, Any] = {
         "paired by": result["paired_by"],
         "columns": " and ".join(result["columns"].values()),
-        "events": f"{result['events_a']} and {result['events_b']}",
+        "events": f"{result['events_a']} and {result['events_b']}; {pairs} in pairs",
     }
     for number, part in enumerate(result["stretches"], 1):
         seconds = (part["last_ns"] - part["first_ns"]) / 1e9

@@ -399,7 +399,7 @@ def _of_text(text: str) -> Iterator[Source]:
         device, _, size = place.partition("@")
         width, x, height = (size or "1280x720").partition("x")
         if not (x and width.isdecimal() and height.isdecimal()):
-            raise InputError("STREAMS", "", text, "must be usb:DEVICE@WIDTHxHEIGHT")
+            raise InputError("STREAMS", "", text, "must be usb:DEVICE or usb:DEVICE@WIDTHxHEIGHT")
         yield usb_camera(name or FRAMES_KIND, device, (int(width), int(height)))
         return
     path = Path(text)

@@ -58,6 +58,8 @@ class UvcCamera:
     """
 
     def __init__(self, settings: UvcSettings, px_per_mm: float) -> None:
+        if (why := why_unreachable(settings)) is not None:
+            raise RigError(DEVICE, why)
         self.settings, self.px_per_mm = settings, px_per_mm
         self.mid_exposure_ns = round(settings.exposure_us * 500)
         self.stamping = VideoStamping("host arrival", "host arrival")

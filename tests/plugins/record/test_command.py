@@ -80,7 +80,7 @@ def test_for_and_every_make_trials_of_their_length(tmp_path: Path, streams: Path
         (["lsl:x", "--set", "mug"], "must be NAME=VALUE"),
         (["lsl:x", "--set", "a=1", "--set", "a=2"], "gives a condition twice"),
         (["lsl:x", "--set", "grip_n=1", "--set", "grip=2"], "gives the factor grip a second time"),
-        (["usb:/dev/video0@big"], "must be usb:DEVICE@WIDTHxHEIGHT"),
+        (["usb:/dev/video0@big"], "must be usb:DEVICE or usb:DEVICE@WIDTHxHEIGHT"),
         (["rehearsal.yaml"], "no such file"),
         (["loopback"], "a file of streams, lsl:NAME or usb:DEVICE"),
         (["usb:"], "a file of streams, lsl:NAME or usb:DEVICE"),
