@@ -39,8 +39,9 @@ _EVIDENCE = 14.0
 """Log-likelihood ratio at which a stretch ends."""
 _SHIFTS = 32
 _REFUSALS = {
-    "ambiguous": "the lists fit in more than one place, as regular pulses do: check that both saw "
-    "the same events, and send a code or random intervals",
+    "ambiguous": "the lists fit in more than one place, as regular pulses do, or halves of a list "
+    "with a jump in its middle: check that both saw the same events, and send a code or random "
+    "intervals",
     "too_few_pulses": f"no {MIN_EVENTS} events of A come as close together as those of B",
 }
 
