@@ -9,7 +9,7 @@ of that strip.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ Floats = NDArray[np.float64]
 
 MIN_PAIRS = 3
 MOST_YEARS = 100
+PIECE = 64
+"""Messages of which each run between two jumps of a clock holds a whole piece."""
+MOST_ROWS = 4000
+"""Messages whose bounds say as much about a straight line as those of all."""
 
 
 class BoundsContradictError(ValueError):
@@ -53,9 +57,15 @@ class BoundedClock:
 
 
 def fit_bounds(
-    device_ns: Ints, not_before_ns: Ints, not_after_ns: Ints, max_drift_ppm: float
+    device_ns: Ints,
+    not_before_ns: Ints,
+    not_after_ns: Ints,
+    max_drift_ppm: float,
 ) -> BoundedClock:
     """The clock map that lies between bounds.
+
+    A jump that is smaller than the distance of the bounds cannot be seen. The uncertainty of
+    readings holds for a clock that does not jump.
 
     Args:
         device_ns: (n,) int64 times on the device's clock.
@@ -126,6 +136,27 @@ def fit_bounds(
         widest_ns=widest,
         slowest_ns=slowest,
     )
+
+
+def fit_messages(
+    device_ns: Ints, not_before_ns: Ints, not_after_ns: Ints, max_drift_ppm: float
+) -> BoundedClock:
+    """The clock map between bounds of messages, of which there are many.
+
+    As `fit_bounds`, with an uncertainty that holds also where the device's clock jumps unseen: by
+    less than the delays of messages vary, with at least 2 `PIECE` messages before, after and
+    between jumps. Within such a run the clock is straight, and one whole piece bounds it.
+    """
+    device, low, high = (np.asarray(a, np.int64) for a in (device_ns, not_before_ns, not_after_ns))
+    some = slice(None, None, max(1, device.size // MOST_ROWS))
+    found = fit_bounds(device[some], low[some], high[some], max_drift_ppm)
+    mapped = np.asarray(found.map.to_reference(device))
+    starts = np.arange(0, max(1, device.size // PIECE) * PIECE, PIECE)
+    lengths = np.diff(device[starts], append=device[-1])
+    spread = 4e-6 * max_drift_ppm * lengths + np.maximum(
+        np.minimum.reduceat(high - mapped, starts), -np.maximum.reduceat(low - mapped, starts)
+    )
+    return replace(found, uncertainty_ns=max(found.uncertainty_ns, float(spread.max())))
 
 
 def _missed_us(rows: Floats, limits: Floats, drift: tuple[float, float]) -> float:

@@ -22,6 +22,7 @@ from sliplab.analysis.clocks.clock_bounds import (
     BoundedClock,
     BoundsContradictError,
     fit_bounds,
+    fit_messages,
 )
 from sliplab.analysis.clocks.clocks import (
     UNDISTURBED,
@@ -50,8 +51,9 @@ from sliplab.storage.trials.hdf5_writer import STREAM_GROUP
 from sliplab.storage.trials.recording import Recording
 
 I64 = npt.NDArray[np.int64]
+FitBounds = Callable[[I64, I64, I64, float], BoundedClock]
 
-VERSION = 6
+VERSION = 7
 """Version of the fit; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
@@ -420,12 +422,11 @@ def _by_exposures(begins: I64, streams: SyncStreams, timing: Timing) -> DeviceSy
 
 def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
     """Bound a pose's time: it was sent before it arrived, at most by its transmission time."""
-    # bounds of some thousand poses say as much as those of all
-    some = slice(None, None, max(1, streams.pose_ns.size // 4000))
     bounded = _bounded(
-        _sent(streams.pose_ns[some], streams.pose_host_ns[some], timing.pose_delay),
+        _sent(streams.pose_ns, streams.pose_host_ns, timing.pose_delay),
         timing.arm_controller.drift_ppm + HOST_PPM,
         "poses",
+        fit_messages,
     )
     return _through_host(bounded, streams, timing, timing.arm)
 
@@ -452,8 +453,8 @@ def _by_samples(
     device, host = samples
     if np.any(np.diff(device) < 0):
         raise ClockRefused("residuals", f"its clock fell back during the trial; {UNDISTURBED}")
-    some = slice(None, None, max(1, device.size // 4000))
-    bounded = _bounded(_sent(device[some], host[some], how.delay), how.drift_ppm + HOST_PPM, name)
+    sent = _sent(device, host, how.delay)
+    bounded = _bounded(sent, how.drift_ppm + HOST_PPM, name, fit_messages)
     return _through_host(bounded, streams, timing, how.grade)
 
 
@@ -491,13 +492,15 @@ def _box(streams: SyncStreams, timing: Timing) -> BoundedClock:
     return _bounded(streams.box_reads, drift, "readings of the sync box's clock")
 
 
-def _bounded(reads: ClockReads, drift_ppm: float, name: str) -> BoundedClock:
+def _bounded(
+    reads: ClockReads, drift_ppm: float, name: str, fit: FitBounds = fit_bounds
+) -> BoundedClock:
     if reads.device_ns.size < MIN_PAIRS:
         raise BoundsContradictError(
             f"{reads.device_ns.size} {name}; at least {MIN_PAIRS} are needed: record for longer, "
             "and check that the device answers"
         )
     try:
-        return fit_bounds(reads.device_ns, reads.before_ns, reads.after_ns, drift_ppm)
+        return fit(reads.device_ns, reads.before_ns, reads.after_ns, drift_ppm)
     except BoundsContradictError as error:
         raise BoundsContradictError(f"{name}: {error}") from None

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.clocks.clock_bounds import BoundsContradictError, fit_bounds
+from sliplab.analysis.clocks.clock_bounds import BoundsContradictError, fit_bounds, fit_messages
 
 
 @pytest.mark.long
@@ -54,6 +54,41 @@ def test_messages_with_a_known_longest_delay() -> None:
     # not far below half of what is allowed: not the millisecond that it looks like
     assert 8_000_000 < found.uncertainty_ns < 10_000_000
     assert np.abs(found.map.to_reference(device) - device).max() <= found.uncertainty_ns
+
+
+@pytest.mark.parametrize("jumps", [(), (0.5,), (0.2, 0.7), (0.04,)])
+@pytest.mark.parametrize("delay", ["even", "rarely long", "nearly constant"])
+@pytest.mark.parametrize("jump_ms", [-4.5, -3.0, 0.4, 4.5])
+def test_a_jump_that_hides_among_delays_stays_within_the_bound(
+    jump_ms: float, delay: str, jumps: tuple[float, ...]
+) -> None:
+    rng = np.random.default_rng([round(jump_ms * 10) % 1000, len(delay), len(jumps)])
+    true = np.cumsum(rng.integers(7_000_000, 9_000_000, 4000))
+    taken_ms = {
+        "even": rng.uniform(0, 20, true.size),
+        "rarely long": np.minimum(0.5 + rng.exponential(1.0, true.size), 20),
+        "nearly constant": rng.uniform(4.0, 4.3, true.size),
+    }[delay]
+    arrival = true + np.rint(1e6 * taken_ms).astype(np.int64)
+    clock = true + np.rint(30e-6 * true).astype(np.int64)
+    for share in jumps:
+        clock = np.where(np.arange(true.size) < share * true.size, clock, clock + jump_ms * 1e6)
+    device = np.rint(clock).astype(np.int64)
+    found = fit_messages(device, arrival - 30_000_000, arrival, 100.0)
+    assert np.abs(found.map.to_reference(device) - true).max() <= found.uncertainty_ns
+    assert found.uncertainty_ns < 31_000_000
+
+
+def test_without_a_jump_the_bound_of_messages_is_little_wider() -> None:
+    rng = np.random.default_rng(4)
+    device = np.arange(15_000, dtype=np.int64) * 2_000_000
+    arrival = device + rng.integers(500_000, 8_000_000, device.size)
+    strict = fit_bounds(device, arrival - 20_000_000, arrival, 100.0)
+    found = fit_messages(device, arrival - 20_000_000, arrival, 100.0)
+    assert strict.uncertainty_ns < found.uncertainty_ns < 1.15 * strict.uncertainty_ns
+    assert found.map.to_reference(device).tolist() == pytest.approx(
+        strict.map.to_reference(device).tolist(), abs=100_000
+    )
 
 
 def test_contradictions_are_errors() -> None:
