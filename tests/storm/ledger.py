@@ -71,6 +71,7 @@ class Ledger:
         self._rates: dict[str, float] = {}
         self._skin = request.rig.skin.serial
         self._skins: dict[str, str] = {}
+        self._logs: dict[str, Any] | None = None
         self._sent: dict[str, dict[str, Any]] = {}
         self.takes: dict[str, list[Sums]] = {}
         self._pulled: dict[str, Sums] = {}
@@ -144,11 +145,17 @@ class Ledger:
                 self._skins[note["begins"]] = self._skin
             if "recorded" in note:
                 self._sent[note["recorded"]] = note
+            if "logs" in note:
+                self._logs = note
             if "logged" in note:
-                self.logged[note["logged"]] = note["at_s"]
-                self._skin = note.get("skin", self._skin)
+                self._take_log(note["logged"], note)
             if "number" in note:
                 self.asked[note["number"]] = note["asked"]
+
+    def _take_log(self, text: str, note: dict[str, Any]) -> None:
+        self.logged[text] = note["at_s"]
+        self._skin = note.get("skin", self._skin)
+        self._logs = None
 
     # -- trials ----------------------------------------------------------------------------
 
@@ -483,6 +490,9 @@ class Ledger:
         entries = log_entries(store, faults)
         if faults:
             raise Wrong("a log is true", faults[0].replace(str(self._folder), ""))
+        # a kill may come between an entry and its note
+        if self._logs and any(self._logs["logs"] in entry.text for entry in entries):
+            self._take_log(self._logs["logs"], self._logs)
         for text, at_s in self.logged.items():
             when = [entry.when for entry in entries if text in entry.text]
             if not any(abs(datetime.fromisoformat(each).timestamp() - at_s) <= 1 for each in when):

@@ -56,6 +56,7 @@ from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify_trial
 from tests.storm.alerts import watch
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
@@ -339,8 +340,10 @@ def _log(process: Process, step: dict[str, Any]) -> None:
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
         return
+    about = {"at_s": process.host.wall_s, **(context or {})}
+    process.notes.add(logs=text, **about)
     add_note(store, text, who="anna", context=context)
-    process.notes.add(logged=text, at_s=process.host.wall_s, **(context or {}))
+    process.notes.add(logged=text, **about)
 
 
 def check(process: Process, step: dict[str, Any]) -> None:
@@ -388,8 +391,9 @@ def bring(process: Process, step: dict[str, Any]) -> None:
     folder = process.stage.store / "campaigns" / NAME / "trials"
     if not file.exists():
         trials = sorted(folder.iterdir()) if folder.is_dir() else []
-        # not every rig has an event camera
+        # not every rig has an event camera, and another step may have damaged a trial
         trials = [each for each in trials if TrialRecord.load(each / "record.json").counts.events]
+        trials = [each for each in trials if not verify_trial(each)]
         if not trials:
             return
         shutil.copy(trials[0] / "data.h5", file)
