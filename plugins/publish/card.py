@@ -25,9 +25,9 @@ for record in data.records("trials"):
 """
 _LOADS = {
     "croissant": """
-Events, poses and clocks are in `data.h5` of each trial's folder (HDF5 with the filters of the
-package `hdf5plugin`), the maps of its clocks in `record.json`. The folder is also a store of
-SlipLab: `sliplab.open_store(".")`.
+Events, poses and clocks are in `data.h5` of each trial's folder (HDF5; unless `sliplab record`
+wrote it, with the filters of the package `hdf5plugin`), the maps of its clocks in `record.json`.
+The folder is also a store of SlipLab: `sliplab.open_store(".")`.
 """,
     "mcap": """
 Each trial is an MCAP file of ROS 2 messages, which Foxglove opens; in Python with the packages

@@ -3,8 +3,9 @@
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
 index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
 other streams are in the same file. Columns are chunked and compressed with bitshuffle, events in
-LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
-same data are the same bytes.
+LZ4 and the others in zstd; of a recording without a protocol in gzip, which every HDF5 reads, for
+its other readers are not known. Attributes give every column its unit. Files carry no time stamps:
+the same data are the same bytes.
 
 A trial has more columns than most of them have chunks, so that making, opening and resizing them
 costs more than their data. So every file begins as a copy of one that has all columns and no rows,
@@ -120,34 +121,39 @@ INDEXED_MS = 2**32 // 1000 + 1
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
 _SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
 _EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")
+_PORTABLE = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 # whole bytes: the lowest one of a time is noise, the highest ones are all but constant
 _TIMES = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
 
 
 @cache
-def blank() -> bytes:
+def blank(guarded: bool = False) -> bytes:
     """Make a file with every column of `COLUMNS`, an index and an offset, and no rows."""
     made = BytesIO()
     with h5py.File(made, "w", libver="latest") as file:
         file.attrs["format"] = FORMAT
-        for name, column in COLUMNS.items():
-            create(file, name, column)
+        for name, column in (COLUMNS | ({TIMES: WIDE} if guarded else {})).items():
+            create(file, name, column, guarded)
         marks = Column("", "int64", (), "index of the first event at or after this ms")
-        create(file, INDEX, marks)
+        create(file, INDEX, marks, guarded)
         file[OFFSET] = np.int64(0)
         file[OFFSET].attrs["unit"] = "us of the event camera's clock"
     return made.getvalue()
 
 
-def create(file: Any, name: str, column: Column) -> None:
-    """Make a dataset without rows in an open `h5py.File`."""
+def create(file: Any, name: str, column: Column, guarded: bool = False) -> None:
+    """Make a dataset without rows in an open `h5py.File`.
+
+    Args:
+        guarded: for a recording beside other programs: with filters that every HDF5 has.
+    """
     data = file.create_dataset(
         name,
         (0, *column.shape),
         column.dtype,
         maxshape=(None, *column.shape),
         chunks=(_chunk(name), *column.shape),
-        **_filter(name),
+        **(_PORTABLE if guarded else _filter(name)),
     )
     data.attrs["unit"] = column.unit
 
@@ -256,21 +262,22 @@ class StreamFile:
 
     def __init__(self, path: Path, expected: Mapping[str, Iterable[Chunk]] | None = None) -> None:
         self.path = path
-        path.write_bytes(blank())
+        self._guarded = self._wide = expected is not None
+        path.write_bytes(blank(self._guarded))
         self._file = h5py.File(path, "r+", libver="latest", rdcc_nbytes=CACHE_BYTES)
         self._offset: int | None = None
         self._last_us: int | None = None
         self._next_ms = 0
-        self._wide = False
         self._kinds: dict[str, StreamKind] = {}
         self._columns = {name: _Rows(self._file, name) for name in (*COLUMNS, INDEX)}
         if expected is not None:
             self._guard(expected)
 
     def _guard(self, expected: Mapping[str, Iterable[Chunk]]) -> None:
-        """Make all columns, and let HDF5 write in an order in which the file is always readable."""
-        self._columns[TIMES] = self._columns[TIMES].widened(self._file, TIMES, WIDE)
-        self._wide = True
+        """Make all columns, and let HDF5 write in an order in which the file is always readable.
+
+        HDF5's cache of its indexes would grow to 32 MiB within a long recording.
+        """
         for device, chunks in expected.items():
             for chunk in chunks:
                 path = self._path(device, chunk.KIND)
@@ -278,6 +285,10 @@ class StreamFile:
                     self._make(path, chunk)
         for column in self._columns.values():
             column.crc = 0
+        cache = self._file.id.get_mdc_config()
+        cache.set_initial_size, cache.incr_mode, cache.flash_incr_mode = True, 0, 0
+        cache.initial_size = cache.max_size = cache.min_size = CACHE_BYTES
+        self._file.id.set_mdc_config(cache)
         self._file.swmr_mode = True
 
     def mark(self) -> Json:
@@ -391,7 +402,7 @@ class StreamFile:
                 column.append(values)
 
     def _create(self, name: str, column: Column) -> None:
-        create(self._file, name, column)
+        create(self._file, name, column, self._guarded)
         self._columns[name] = _Rows(self._file, name)
 
     def finish(self) -> None:

@@ -1,5 +1,7 @@
 """The HDF5 file of a trial gives back what was put in, in the layout that others read."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -9,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.storage.streams import EventChunk, PulseChunk
+from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, PulseChunk, ScalarChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import COLUMNS, SMALL_HELD, StreamFile
 from tests.storage.trial_files import events
@@ -229,3 +231,40 @@ def test_a_long_file_with_the_full_index_of_older_versions_reads_the_same(tmp_pa
             for end in edges:
                 mask = (whole.t_us >= start) & (whole.t_us < end)
                 assert np.array_equal(reader.events(start, end).t_us, whole.t_us[mask])
+
+
+ALONE = """
+import sys
+import h5py
+with h5py.File(sys.argv[1]) as file:
+    found = []
+    file.visititems(lambda name, at: found.append(at[()]) if isinstance(at, h5py.Dataset) else None)
+    print(len(file["events/t"]), int(file["events/t"][-1]), file["streams/grip/value"][7])
+assert "hdf5plugin" not in sys.modules
+"""
+
+
+def test_a_recording_without_a_protocol_is_read_by_h5py_alone(tmp_path: Path) -> None:
+    """Whoever records beside a program of their own has none of our packages."""
+    path, late_us = tmp_path / "data.h5", 2**33
+    t_ns = np.arange(70_000, dtype=np.int64)
+    values = ScalarChunk(t_ns, t_ns, np.sin(t_ns / 100.0), "mm")
+    expected: dict[str, tuple[Chunk, ...]] = {
+        "events": (EventChunk.empty(),),
+        "frames": (FrameChunk.empty(),),
+        "grip": (values[:0],),
+    }
+    file = StreamFile(path, expected)
+    sent = events(70_000)
+    file.add("events", sent)
+    file.mark()
+    file.add("events", EventChunk(sent.x[:1], sent.y[:1], sent.p[:1], sent.t_us[:1] + late_us))
+    file.add("grip", values)
+    file.finish()
+    read = subprocess.run(
+        [sys.executable, "-c", ALONE, path], capture_output=True, text=True, check=False
+    )
+    assert read.returncode == 0, read.stderr
+    assert read.stdout.split() == ["70001", str(late_us), str(np.sin(0.07))]
+    with StreamReader(path) as reader:
+        np.testing.assert_array_equal(reader.events().x[:-1], sent.x)
