@@ -437,9 +437,10 @@ class Ledger:
         """What the remote store shows is there in whole; what was pulled is a trial of ours."""
         remote = self._folder.parent / "remote" / "campaigns" / NAME
         shown: dict[str, dict[str, str]] = {}
-        for path in sorted((remote / "trials").glob("*.json")):
+        for path in sorted([*remote.glob("*.json"), *remote.glob("*/*.json")]):
             files = {name: known["sha256"] for name, known in read_json(path)["files"].items()}
-            shown[path.stem] = files
+            if path.parent.name == "trials":
+                shown[path.stem] = files
             for name, sha in files.items():
                 here = remote / "objects" / sha
                 if sha in self.spoilt:

@@ -105,12 +105,15 @@ def draw(seed: int) -> Story:
     for number in range(rng.randint(8, 14)):
         kind = rng.choices(kinds, [STEPS[name][0] for name in kinds])[0] if number else "night"
         last = steps[-1] if steps else {}
-        ended = last.get("weather", {}).keys() & {"kill", "power"}
-        if (ended or last.get("do") in {"push", "damage"}) and rng.random() < 0.5:
+        weather = last.get("weather", {})
+        ended = weather.get("kill") or weather.get("power")
+        if ended and ended.get("name") == "/trials" and rng.random() < 0.5:
+            kind = "damage"  # a trial that is complete, and not yet committed
+        elif (ended or last.get("do") in {"push", "damage"}) and rng.random() < 0.5:
             kind = rng.choice(FOLLOWS.get(last["do"], ("verify",)))
         step = {"do": kind, **STEPS[kind][1](rng, story, trials)}
         if ended and kind == "damage" and last["do"] == "night":
-            step |= {"where": "incoming", "how": "cut"}
+            step["where"] = "incoming"
         steps.append(step)
     return {**story, "steps": steps}
 
@@ -282,8 +285,7 @@ def _night(rng: random.Random, story: Story, trials: int) -> Step:
 
 def _damage(rng: random.Random, story: Story, trials: int) -> Step:
     where = rng.choice(["trials", "trials", "incoming", "remote"])
-    how = "cut" if where == "incoming" else rng.choice(["cut", "flip"])
-    return {"trial": rng.randrange(trials), "where": where, "how": how}
+    return {"trial": rng.randrange(trials), "where": where, "how": rng.choice(["cut", "flip"])}
 
 
 def _copy(rng: random.Random, kind: str) -> Step:
