@@ -47,6 +47,8 @@ from sliplab.protocols.shown import (
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
+_KINDS = ("protocol", "rig")
+"""First keys of files that people take for each other."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Beginning of a URL that was taken for a path, which has one of its two slashes."""
 
@@ -442,8 +444,10 @@ def parse_leniently(text: str, path: str | Path) -> YamlDocument:
     if not isinstance(data, dict):
         if builder.faults:
             raise InputError.joined(builder.faults)
-        found = "nothing" if data is None else f"a {type(data).__name__}"
-        raise InputError(path, "", None, f"holds {found} instead of a mapping (key: value)")
+        found = "nothing" if data is None else "a list" if isinstance(data, list) else "one value"
+        raise InputError(
+            path, "", None, f"holds {found}; it must hold lines of the form key: value"
+        )
     return YamlDocument(data, builder.written, builder.faults)
 
 
@@ -496,6 +500,9 @@ def validate(
         InputError: all that is wrong with it.
     """
     document = data if isinstance(data, YamlDocument) else YamlDocument(data, {})
+    if (other := _other_kind(model, data)) is not None:
+        wanted = next(iter(model.model_fields))
+        raise InputError(path, other, data[other], f"begins a {other} file; give a {wanted} file")
     unread = [fault.key for fault in document.faults]
     found: list[KeyedError] = []
     checked: Sequence[KeyedError] = ()
@@ -522,6 +529,12 @@ def validate(
         raise InputError.joined(by_key.values())
     assert made is not None
     return made
+
+
+def _other_kind(model: type[BaseModel], data: dict[str, Any]) -> str | None:
+    """Return the kind of a file that was given instead of another one."""
+    first = next(iter(data), None)
+    return first if first in _KINDS and first not in model.model_fields else None
 
 
 def _as_written(document: YamlDocument, fault: KeyedError) -> object:

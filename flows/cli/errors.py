@@ -240,5 +240,8 @@ def _wrong_usage(error: TyperException) -> Failure:
             expected = "must be a number"
         message = f"{key} = {value}: {expected}"
     if message:
-        message += " (see --help)"
+        command = getattr(getattr(error, "ctx", None), "command", None)
+        example = getattr(command, "epilog", None)  # of one command, not of a group
+        message = f"{message.rstrip('.')} (see --help)"
+        message += f". {example}" if example else ""
     return Failure(message, exit_codes.WRONG_INPUT, None, key, value)

@@ -111,7 +111,7 @@ LAUGHS = "a0: &a0 [x, x]" + "".join(
 RAW = {
     "not a mapping": (b"- a\n- b\n", "holds a list"),
     "empty": (b"", "holds nothing"),
-    "text": (b"hello", "holds a str"),
+    "text": (b"hello", "holds one value"),
     "not UTF-8": (b"name: caf\xe9\n", "is not UTF-8"),
     "broken": (b"a: [1, 2\n", "cannot be read"),
     "key twice": (b"a: 1\na: 2\n", "duplicate key"),
