@@ -23,7 +23,7 @@ from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import FORGIVEN, Campaign, Store
 from sliplab.storage.trials.verify import content_problems, verify_trial
-from tests.storm.sent import differences
+from tests.storm.sent import differences, most_events
 from tests.storm.steps import NAME
 
 LATER = {"cause.json"}
@@ -260,7 +260,7 @@ class Ledger:
             raise Wrong("a record is true", f"{name}: skin {skin}, {self._skins[name]} was logged")
         if not record.simulated or not Campaign(self._campaign).info["simulated"]:
             raise Wrong("nothing simulated is unmarked", name)
-        self._check_gates(name, record)
+        self._check_gates(name, record, folder)
         truth = (record.simulation_truth or {}).get("clocks", {})
         for device, clock in record.clocks.devices().items():
             pairs = np.array(truth.get(DEVICES.get(device, device), ()))
@@ -298,7 +298,7 @@ class Ledger:
             if states != true:
                 raise Wrong("a record is true", f"{name}: {key} = {states}, not {true}")
 
-    def _check_gates(self, name: str, record: TrialRecord) -> None:
+    def _check_gates(self, name: str, record: TrialRecord, folder: Path) -> None:
         """Every gate of the protocol was applied, with its limit, to what was recorded."""
         gates, seen, asked = record.quality.gates, self._sent[name], self._gates
         limits: dict[str, Any] = {
@@ -330,6 +330,10 @@ class Ledger:
             if not (found.passed and 0 <= value <= limit == float(limits.get(gate, limit))):
                 what = f"{name}: {gate} = {value}, limit {limit}, asked {limits.get(gate)}"
                 raise Wrong("what is committed passed its gates", what)
+        burst = gates.get("event_burst")
+        if burst is not None and burst.value != (most := most_events(folder)):
+            what = f"{name}: event_burst = {burst.value}, there are {most}"
+            raise Wrong("a gate sees what was recorded", what)
         for key, value, limit in (
             ("strayed_mm", seen["strayed_mm"], 1.2 * float(asked.path_deviation) + STRAY_MM),
             ("lost", seen["lost"], asked.frames_lost),

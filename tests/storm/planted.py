@@ -24,8 +24,8 @@ from sliplab.rigs.core.capabilities import ArmState
 from sliplab.storage import files
 from sliplab.storage.remote import objects, pull
 from sliplab.storage.remote import push as pushing
-from sliplab.storage.streams import NullSink
-from sliplab.storage.trials import control, journal, recovery, store, writer
+from sliplab.storage.streams import EventChunk, NullSink
+from sliplab.storage.trials import control, hdf5_writer, journal, recovery, store, writer
 
 PLANTS: dict[str, Callable[[], None]] = {}
 
@@ -467,3 +467,30 @@ def left_writable() -> None:
 def measured_wide() -> None:
     """A pose on the way may be three millimetres beyond the limits."""
     guard.MEASURED_MM = 3.0  # type: ignore[misc]
+
+
+# -- a sixth set: what is stored, and what gates look at -------------------------------------------
+
+
+@plant
+def polarity_flipped() -> None:
+    """Events are stored with the other polarity."""
+    add = hdf5_writer.StreamFile.add
+
+    def flipping(self: hdf5_writer.StreamFile, device: str, chunk: Any) -> None:
+        events = isinstance(chunk, EventChunk)
+        add(self, device, replace(chunk, p=1 - chunk.p) if events else chunk)
+
+    hdf5_writer.StreamFile.add = flipping  # type: ignore[method-assign]
+
+
+@plant
+def burst_unjudged() -> None:
+    """The gate of bursts of events looks at none."""
+    quality._event_burst = lambda event_us: 0
+
+
+@plant
+def reserve_used() -> None:
+    """A trial may use what is to stay free on the disk."""
+    watches.RESERVE = 0  # type: ignore[attr-defined]

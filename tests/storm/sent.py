@@ -18,8 +18,9 @@ from sliplab.storage.trials.hdf5_writer import GROUPS, STREAM_GROUP
 Column = list[int]
 """Rows, and a checksum of their bytes."""
 _OWN = {(device, kind.name): group for group, (device, kind) in GROUPS.items()}
-_MORE = {"poses": ("xyz",), "wrench": ("force",), "scalar": ("value",)}
-"""Parts of each kind that are compared besides its times."""
+_NAMED = {"wrench", "scalar"}
+"""Kinds of named streams that are compared, too."""
+BURST_US = 10_000
 
 
 class Tee:
@@ -47,9 +48,9 @@ class Tee:
         group = _OWN.get((device, kind.name), f"{STREAM_GROUP}/{device}")
         if isinstance(chunk, PoseChunk):
             self.poses.append(chunk.xyz_mm)
-        known = (device, kind.name) in _OWN or kind.name in _MORE
-        for part in ("t", *_MORE.get(kind.name, ())) if known else ():
-            _add(self.columns[f"{group}/{part}"], getattr(chunk, kind.columns[part].field))
+        if (device, kind.name) in _OWN or kind.name in _NAMED:
+            for part, column in kind.columns.items():
+                _add(self.columns[f"{group}/{part}"], getattr(chunk, column.field))
         self.inner.add(device, chunk)
 
 
@@ -57,6 +58,14 @@ def _add(column: Column, values: npt.NDArray[Any]) -> None:
     column[0] += len(values)
     whole = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
     column[1] = zlib.crc32(np.ascontiguousarray(whole), column[1])
+
+
+def most_events(folder: Path) -> int:
+    """Return the most events in any 10 ms of a trial that begin with an event."""
+    with StreamReader(folder / DATA) as reader:
+        t_us = reader.event_times()
+    ends = np.searchsorted(t_us, t_us + BURST_US)
+    return int((ends - np.arange(len(t_us))).max(initial=0))
 
 
 def differences(folder: Path, sent: dict[str, Column]) -> list[str]:
