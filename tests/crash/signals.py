@@ -25,6 +25,7 @@ from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.crash.campaign import NAME, collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.process import live
+from tests.patching import put
 
 SOFT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PHASES = ("campaign", "trial", "motion")
@@ -93,7 +94,7 @@ class Tracer:
             finally:
                 self._moving = False
 
-        Rig.run_trial = run_trial  # type: ignore[method-assign]
+        put(Rig, "run_trial", run_trial)
         sys.setprofile(self._profile)
         self._trace_stack(sys._getframe())
 

@@ -11,6 +11,7 @@ from sliplab.plugins.simulation.arm import MockArm
 from sliplab.plugins.simulation.force import MockForceSensor
 from sliplab.rigs.core.capabilities import ArmState, Pose, Progress
 from sliplab.storage.streams import WrenchChunk
+from tests.patching import put
 
 OF_ARM = ("pose_nan", "pose_frozen", "pose_away", "pose_creep", "path_done")
 OF_FORCE = ("force_nan", "force_high", "force_silent", "force_frozen")
@@ -93,9 +94,9 @@ class Lie:
                 force_n[:] = self._load.force_n[-1]
             return replace(true, force_n=force_n)
 
-        MockArm.pose = reported  # type: ignore[method-assign]
-        MockArm.progress = progressed  # type: ignore[method-assign]
-        MockForceSensor.read = forces  # type: ignore[method-assign]
+        put(MockArm, "pose", reported)
+        put(MockArm, "progress", progressed)
+        put(MockForceSensor, "read", forces)
 
     def _false(self, true: Pose, kind: str) -> Pose:
         """Return what is reported instead of a true pose."""

@@ -21,6 +21,7 @@ from prefect.states import Cancelled, Cancelling, Completed, Running, Scheduled
 from sliplab.flows.running import run_records
 from sliplab.plugins.web.server import runs, schedules
 from sliplab.plugins.web.server.runs import ServedRuns
+from tests.patching import put
 from tests.storm.virtual import Notes
 
 POLL_S = 1.0
@@ -240,7 +241,7 @@ async def _play(page: Page, served: ServedRuns, rig: UUID, words: UUID, rng: ran
 
 def _close_left(page: Page, store: Path, rig: UUID, rng: random.Random) -> None:
     """What a killed program left is closed by the next start, on its own server alone."""
-    run_records.is_here = lambda process: False  # type: ignore[attr-defined]
+    put(run_records, "is_here", lambda process: False)
     wanted: dict[UUID, str] = {}
     for _ in range(4):
         page.due(rig)
@@ -276,7 +277,7 @@ def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     _check_windows(rng, notes)
     _check_begins(rng, notes)
     page = Page(rng, notes, store, lost)
-    runs.monotonic = lambda: page.now_s  # type: ignore[attr-defined]
+    put(runs, "monotonic", lambda: page.now_s)
     runs.asyncio = SimpleNamespace(  # type: ignore[attr-defined]
         **{**vars(asyncio), "create_subprocess_exec": page.start}
     )

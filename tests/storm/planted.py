@@ -26,6 +26,7 @@ from sliplab.storage.remote import objects, pull
 from sliplab.storage.remote import push as pushing
 from sliplab.storage.streams import EventChunk, NullSink
 from sliplab.storage.trials import control, hdf5_writer, journal, recovery, store, writer
+from tests.patching import put
 
 PLANTS: dict[str, Callable[[], None]] = {}
 
@@ -47,13 +48,13 @@ def nothing(*given: Any, **named: Any) -> None:
 def commit_unflushed() -> None:
     """The rename that commits a trial is not flushed: a power cut takes the trial back."""
     for module in (writer, recovery):
-        module.make_visible = lambda folder, target: os.rename(folder, target)  # type: ignore[attr-defined]
+        put(module, "make_visible", lambda folder, target: os.rename(folder, target))
 
 
 @plant
 def data_unflushed() -> None:
     """A trial's data are not flushed before its record is written."""
-    writer.sync_file = nothing  # type: ignore[attr-defined]
+    put(writer, "sync_file", nothing)
 
 
 @plant
@@ -73,7 +74,7 @@ def again_deletes() -> None:
             return folder
         return quarantine(campaign, folder, cause, **more)
 
-    store.Campaign.quarantine = deleting  # type: ignore[method-assign]
+    put(store.Campaign, "quarantine", deleting)
 
 
 @plant
@@ -85,7 +86,7 @@ def journal_reuses() -> None:
         files.write_json(self.path(max(number - 1, 1)), data)
         return True
 
-    journal.Journal.add = add  # type: ignore[method-assign]
+    put(journal.Journal, "add", add)
 
 
 @plant
@@ -97,7 +98,7 @@ def left_open() -> None:
         os.open(folder, os.O_RDONLY)
         sync_folder(folder)
 
-    writer.sync_folder = leaking  # type: ignore[attr-defined]
+    put(writer, "sync_folder", leaking)
 
 
 @plant
@@ -109,7 +110,7 @@ def manifest_first() -> None:
         self.remote.put(made.key, made.dump())
         return send(self, made, folder, existing)
 
-    pushing._Push._send = early  # type: ignore[method-assign]
+    put(pushing._Push, "_send", early)
 
 
 @plant
@@ -123,8 +124,8 @@ def pull_unchecked() -> None:
             data = b""
         files.write_bytes(path, data)
 
-    objects.Remote.get = get  # type: ignore[method-assign]
-    pull.verify_trial = lambda folder: []  # type: ignore[attr-defined]
+    put(objects.Remote, "get", get)
+    put(pull, "verify_trial", lambda folder: [])
 
 
 # -- clocks --------------------------------------------------------------------------------------
@@ -134,7 +135,7 @@ def pull_unchecked() -> None:
 def clock_gate_open() -> None:
     """The gate of the clocks accepts everything."""
     found = quality.sync_gate
-    quality.sync_gate = lambda *given: found(*given).model_copy(update={"passed": True})  # type: ignore[assignment]
+    put(quality, "sync_gate", lambda *given: found(*given).model_copy(update={"passed": True}))
 
 
 # -- rig and watches -----------------------------------------------------------------------------
@@ -143,13 +144,13 @@ def clock_gate_open() -> None:
 @plant
 def stop_unheard() -> None:
     """A stop whose exception was lost is not looked for while the arm moves."""
-    rig.Rig.should_stop = property(lambda self: lambda: False, nothing)  # type: ignore[assignment]
+    put(rig.Rig, "should_stop", property(lambda self: lambda: False, nothing))
 
 
 @plant
 def retracts_always() -> None:
     """An arm in a protective stop is sent clear of the plate."""
-    ArmState.healthy = property(lambda self: True)  # type: ignore[assignment,method-assign]
+    put(ArmState, "healthy", property(lambda self: True))
 
 
 # -- a second set: defects that came to mind after the storm was written ---------------------------
@@ -166,13 +167,13 @@ def skin_once() -> None:
                 self._once = super().read()
             return dict(self._once)
 
-    session.LoggedContext = Once  # type: ignore[misc]
+    put(session, "LoggedContext", Once)
 
 
 @plant
 def retakes_forgotten() -> None:
     """Failed attempts of earlier sessions do not count."""
-    store.Campaign.failed_attempts = lambda self: {}  # type: ignore[method-assign]
+    put(store.Campaign, "failed_attempts", lambda self: {})
 
 
 @plant
@@ -184,42 +185,44 @@ def nan_passes() -> None:
         if pose.xyz_mm[2] == pose.xyz_mm[2]:
             watch(self, pose, *given, **named)
 
-    guard.Guard.check_measured = watching  # type: ignore[method-assign]
-    rig.check_pose = lambda pose: pose  # type: ignore[attr-defined]
+    put(guard.Guard, "check_measured", watching)
+    put(rig, "check_pose", lambda pose: pose)
 
 
 @plant
 def stall_unseen() -> None:
     """An arm whose pose does not change any more is not stopped."""
-    motion_watch.STUCK_S = 1e9  # type: ignore[misc]
+    put(motion_watch, "STUCK_S", 1e9)
 
 
 @plant
 def silence_passes() -> None:
     """A force sensor with a limit may be silent."""
-    force_watch.SILENT_S = 1e9  # type: ignore[misc]
+    put(force_watch, "SILENT_S", 1e9)
 
 
 @plant
 def interval_third() -> None:
     """The stated uncertainty of a clock is a third of what it is: too little for one trial."""
     made = synchronise.DeviceSync.record
-    synchronise.DeviceSync.record = lambda self: made(  # type: ignore[method-assign]
-        replace(self, uncertainty_ns=self.uncertainty_ns / 3)
+    put(
+        synchronise.DeviceSync,
+        "record",
+        lambda self: made(replace(self, uncertainty_ns=self.uncertainty_ns / 3)),
     )
 
 
 @plant
 def remote_trusted() -> None:
     """What is at the URL is taken for what was sent, by its size."""
-    objects.Remote.matches = lambda self, key, known, *more: self.size(key) == known.bytes  # type: ignore[method-assign]
+    put(objects.Remote, "matches", lambda self, key, known, *more: self.size(key) == known.bytes)
 
 
 @plant
 def hold_short() -> None:
     """A wait ends after nine tenths of its time."""
     wait = rig.Rig.wait
-    rig.Rig.wait = lambda self, seconds, sink=None: wait(self, 0.9 * seconds, sink)  # type: ignore[method-assign]
+    put(rig.Rig, "wait", lambda self, seconds, sink=None: wait(self, 0.9 * seconds, sink))
 
 
 @plant
@@ -233,7 +236,7 @@ def run_lost() -> None:
         finally:
             self._asked = None
 
-    runs.ServedRuns._begin = forgetting  # type: ignore[method-assign]
+    put(runs.ServedRuns, "_begin", forgetting)
 
 
 # -- a third set, of kinds that the two before do not have -----------------------------------------
@@ -247,7 +250,7 @@ def reach_unwatched() -> None:
     def deep(self: guard.Guard, *given: Any) -> Any:
         return (each for each in places(self, *given) if each.error is guard.DepthError)
 
-    guard.Guard._places = deep  # type: ignore[method-assign]
+    put(guard.Guard, "_places", deep)
 
 
 @plant
@@ -265,8 +268,8 @@ def zero_of_skin() -> None:
         if paused[0]:
             fresh(self)
 
-    supervisor.CollectionSupervisor.was_paused = was  # type: ignore[method-assign]
-    session.TrialCollector.fresh_start = only_paused  # type: ignore[method-assign]
+    put(supervisor.CollectionSupervisor, "was_paused", was)
+    put(session.TrialCollector, "fresh_start", only_paused)
 
 
 @plant
@@ -274,7 +277,7 @@ def tail_lost() -> None:
     """What devices still hold when their streams stop is not read."""
     stop = rig.Rig.stop_streams
 
-    rig.Rig.stop_streams = lambda self, sink: stop(self, NullSink())  # type: ignore[method-assign]
+    put(rig.Rig, "stop_streams", lambda self, sink: stop(self, NullSink()))
 
 
 @plant
@@ -293,7 +296,7 @@ def free_once() -> None:
 
         self._free = first
 
-    watches.DiskWatch.__init__ = once  # type: ignore[method-assign]
+    put(watches.DiskWatch, "__init__", once)
 
 
 @plant
@@ -304,13 +307,13 @@ def end_guessed() -> None:
     async def guessing(self: runs.ServedRuns, client: Any, *, cancelled: bool) -> None:
         end_of = runs.run_records.end_of
         if cancelled:
-            runs.run_records.end_of = lambda *given: None  # type: ignore[assignment]
+            put(runs.run_records, "end_of", lambda *given: None)
         try:
             await close(self, client, cancelled=cancelled)
         finally:
             runs.run_records.end_of = end_of
 
-    runs.ServedRuns._close = guessing  # type: ignore[method-assign]
+    put(runs.ServedRuns, "_close", guessing)
 
 
 # -- a fourth set: what gates, limits, references, forgiveness and the server do -------------------
@@ -320,7 +323,9 @@ def end_guessed() -> None:
 def force_normal_only() -> None:
     """A force beyond the limit stops the arm only where it presses on the plate."""
     check = force_watch.ForceWatch._check_limit
-    force_watch.ForceWatch._check_limit = lambda self, forces: check(self, forces * [0, 0, 1])  # type: ignore[method-assign]
+    put(
+        force_watch.ForceWatch, "_check_limit", lambda self, forces: check(self, forces * [0, 0, 1])
+    )
 
 
 @plant
@@ -336,13 +341,13 @@ def retracts_home() -> None:
     retract = rig.Rig._retract
 
     def homewards(self: rig.Rig, clear: Any, error: BaseException) -> Any:
-        rig.Position = lambda x, y, depth: made(clear.x_mm, clear.y_mm, depth)  # type: ignore[attr-defined]
+        put(rig, "Position", lambda x, y, depth: made(clear.x_mm, clear.y_mm, depth))
         try:
             return retract(self, clear, error)
         finally:
-            rig.Position = made  # type: ignore[attr-defined]
+            put(rig, "Position", made)
 
-    rig.Rig._retract = homewards  # type: ignore[method-assign]
+    put(rig.Rig, "_retract", homewards)
 
 
 @plant
@@ -353,7 +358,7 @@ def seed_of_first() -> None:
     def first(seed: int, *of: Any) -> int:
         return hashed(seed, 0) if len(of) == 1 else hashed(seed, *of)
 
-    session.hash_integer = first  # type: ignore[attr-defined]
+    put(session, "hash_integer", first)
 
 
 @plant
@@ -368,7 +373,7 @@ def reference_previous() -> None:
             recording = self._campaign.recording(trial.id)
             self._first = trial.id, references.reference_figures(recording, self._gate)
 
-    watches.ReferenceWatch.look = looking  # type: ignore[method-assign]
+    put(watches.ReferenceWatch, "look", looking)
 
 
 @plant
@@ -381,7 +386,7 @@ def status_by_name() -> None:
         there = {path.name for path in campaign.folders("trials")}
         return {name: each for name, each in known.items() if name in there}
 
-    status.StatusReader._folders = seen  # type: ignore[method-assign]
+    put(status.StatusReader, "_folders", seen)
 
 
 @plant
@@ -391,9 +396,9 @@ def never_kills() -> None:
 
     def patient(self: runs.ServedRuns) -> None:
         terminate(self)
-        self._stop_by = runs.monotonic() + runs.STOP_LIMIT_S  # type: ignore[attr-defined]
+        put(self, "_stop_by", runs.monotonic() + runs.STOP_LIMIT_S)
 
-    runs.ServedRuns._terminate = patient  # type: ignore[method-assign]
+    put(runs.ServedRuns, "_terminate", patient)
 
 
 # -- a fifth set: bounds, tails, tellings and requests ---------------------------------------------
@@ -427,13 +432,13 @@ def record_tail() -> None:
         if not last:
             drain(self, writer, begun)
 
-    recorder.RecordedTrial._drain = draining  # type: ignore[method-assign]
+    put(recorder.RecordedTrial, "_drain", draining)
 
 
 @plant
 def told_again() -> None:
     """Who was told of an event is not on the disk, so that another program tells it again."""
-    outbox.write_json = nothing  # type: ignore[attr-defined]
+    put(outbox, "write_json", nothing)
 
 
 @plant
@@ -448,25 +453,25 @@ def again_skipped() -> None:
             control.write_json(campaign.folder / control.SKIPPED, known)
         return did
 
-    requests.control.again = staying  # type: ignore[attr-defined]
+    put(requests.control, "again", staying)
 
 
 @plant
 def more_forgotten() -> None:
     """A trial that is wanted again in a night is left to the next one."""
-    supervisor.CollectionSupervisor.more = lambda self: []  # type: ignore[method-assign]
+    put(supervisor.CollectionSupervisor, "more", lambda self: [])
 
 
 @plant
 def left_writable() -> None:
     """The files of a committed trial are not protected from being written to."""
-    writer.protect = nothing  # type: ignore[attr-defined]
+    put(writer, "protect", nothing)
 
 
 @plant
 def measured_wide() -> None:
     """A pose on the way may be three millimetres beyond the limits."""
-    guard.MEASURED_MM = 3.0  # type: ignore[misc]
+    put(guard, "MEASURED_MM", 3.0)
 
 
 # -- a sixth set: what is stored, and what gates look at -------------------------------------------
@@ -481,7 +486,7 @@ def polarity_flipped() -> None:
         events = isinstance(chunk, EventChunk)
         add(self, device, replace(chunk, p=1 - chunk.p) if events else chunk)
 
-    hdf5_writer.StreamFile.add = flipping  # type: ignore[method-assign]
+    put(hdf5_writer.StreamFile, "add", flipping)
 
 
 @plant
@@ -493,4 +498,4 @@ def burst_unjudged() -> None:
 @plant
 def reserve_used() -> None:
     """A trial may use what is to stay free on the disk."""
-    watches.RESERVE = 0  # type: ignore[attr-defined]
+    put(watches, "RESERVE", 0)

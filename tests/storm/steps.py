@@ -58,6 +58,7 @@ from sliplab.storage.trials.checksums import read_sums
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify_trial
+from tests.patching import put
 from tests.storm.alerts import watch
 from tests.storm.virtual import Host, Notes
 from tests.storm.witness import Witness
@@ -226,7 +227,7 @@ def night(process: Process, step: dict[str, Any]) -> None:
             close()
             _rival(process, witness)  # until here the rig is this program's
 
-        rig.close = closing  # type: ignore[method-assign]
+        put(rig, "close", closing)
         rig.connect()
         trials = session.trials
         while trials:
@@ -538,13 +539,13 @@ def _remote(process: Process, step: dict[str, Any]) -> Remote:
         setattr(remote._fs, name, failing(getattr(remote._fs, name)))
     real_put = remote.put
 
-    def put(key: str, source: bytes | Path) -> None:
+    def sent(key: str, source: bytes | Path) -> None:
         seen[0] += 1
         if fails and not short and seen[0] % fails == 0:
             raise RemoteError("the network is gone")
         real_put(key, source)
 
-    remote.put = put  # type: ignore[method-assign]
+    put(remote, "put", sent)
     return remote
 
 

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from sliplab.plugins.simulation.world import SimulatedWorld
+from tests.patching import put
 
 BEGIN_S = 1_795_456_800.0
 """Time of the host when a story begins, seconds since 1970: the past, for caches have dates."""
@@ -77,9 +78,9 @@ class Host:
                 return cls.fromtimestamp(host.wall_s, tz)
 
         for module in modules_with_dates():
-            module.datetime = Datetime  # type: ignore[attr-defined]
+            put(module, "datetime", Datetime)
         time.time = lambda: host.wall_s
-        shutil.disk_usage = lambda folder: _Usage(10**12, 10**12 - host.free, host.free)  # type: ignore[assignment,misc]
+        put(shutil, "disk_usage", lambda folder: _Usage(10**12, 10**12 - host.free, host.free))
         pass_time = SimulatedWorld.pass_time
 
         def passing(world: SimulatedWorld, ns: int) -> None:
@@ -87,7 +88,7 @@ class Host:
             self.rig_s += ns / 1e9
             self.wait(ns / 1e9)
 
-        SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
+        put(SimulatedWorld, "pass_time", passing)
 
     def wait(self, seconds: float) -> None:
         """Let time pass, with what happens in it."""

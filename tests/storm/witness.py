@@ -30,6 +30,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials import control
 from sliplab.storage.trials.context import SKIN, LoggedContext
+from tests.patching import put
 from tests.storm.lies import FALSE_PLACES, Lie
 from tests.storm.sent import Tee
 from tests.storm.virtual import Host, Notes
@@ -256,16 +257,16 @@ class Witness:
             self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name, **about)
             return done
 
-        MockArm.start = starting  # type: ignore[method-assign]
-        MockForceSensor.zero = zeroing  # type: ignore[method-assign]
-        Rig.press = pressing  # type: ignore[method-assign]
-        Rig._retract = retracting  # type: ignore[method-assign]
-        SimulatedWorld.pass_time = passing  # type: ignore[method-assign]
-        Rig.run_trial = running  # type: ignore[method-assign]
-        Rig.rezero = rezeroing  # type: ignore[method-assign]
-        Rig.start_streams = starting_streams  # type: ignore[method-assign]
-        Rig.stop_streams = stopping_streams  # type: ignore[method-assign]
-        Rig.take_step = stepping  # type: ignore[method-assign]
+        put(MockArm, "start", starting)
+        put(MockForceSensor, "zero", zeroing)
+        put(Rig, "press", pressing)
+        put(Rig, "_retract", retracting)
+        put(SimulatedWorld, "pass_time", passing)
+        put(Rig, "run_trial", running)
+        put(Rig, "rezero", rezeroing)
+        put(Rig, "start_streams", starting_streams)
+        put(Rig, "stop_streams", stopping_streams)
+        put(Rig, "take_step", stepping)
 
     def _count_reads(self) -> None:
         """Count the rows that devices hand over while their streams are recorded, by kind."""
@@ -319,7 +320,7 @@ class Witness:
                 self.wrong("no trial begins on a full disk", f"{self._host.free} bytes are free")
             return may
 
-        supervisor.may_take = asked  # type: ignore[method-assign]
+        put(supervisor, "may_take", asked)
 
     def _look_at_zero(self, rig: Rig) -> None:
         """Hold depth zero, which was just found, against the true plate."""
