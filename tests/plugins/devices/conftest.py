@@ -24,6 +24,7 @@ from sliplab.plugins.devices.ur.fake import FakeUr
 from sliplab.plugins.devices.ur.settings import UrSettings
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
+from tests.plugins.devices.arms import LIMITS
 from tests.rigs.waiting import own_address, until
 
 MakeRobot = Callable[..., FakeUr]
@@ -32,7 +33,6 @@ MakeUr = Callable[..., tuple[UrArm, FakeUr]]
 MakeAbb = Callable[..., tuple[AbbArm, FakeAbb]]
 ABB_PORT, EGM_PORT = 8080, 6510
 LIMIT_S, POLL_S = 60.0, 0.002
-LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
 def ur_settings(host: str, **more: Any) -> UrSettings:

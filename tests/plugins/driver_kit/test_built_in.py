@@ -23,7 +23,8 @@ from sliplab.plugins.uvc import device as uvc
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import listed, load_driver
-from tests.plugins.driver_kit.trying import LIMITS, each_apart, free_udp_port, try_all
+from tests.plugins.devices.arms import LIMITS
+from tests.plugins.driver_kit.trying import each_apart, free_udp_port, try_all
 from tests.rigs.waiting import own_address
 
 pytestmark = pytest.mark.realtime

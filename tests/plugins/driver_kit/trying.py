@@ -6,7 +6,6 @@ import socket
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from typing import Any
 
 from sliplab.plugins.driver_kit.conformance import Case
 from sliplab.plugins.driver_kit.rule import NotTried, RuleBroken
@@ -52,6 +51,3 @@ def free_udp_port() -> int:
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}

@@ -119,14 +119,6 @@ def test_under_load_none_is_missing_and_order_holds(until: Until) -> None:
         assert all(np.all(np.diff(chunk.host_ns) >= 0) for chunk in chunks)
 
 
-def test_the_counter_begins_anew_with_every_start(until: Until) -> None:
-    with opened(**FREE) as camera:
-        for _ in range(2):
-            camera.start()
-            assert numbers_of(collect(camera, 3, until))[:3] == [0, 1, 2]
-            camera.stop()
-
-
 def test_a_reader_that_sleeps_loses_nothing_while_there_are_buffers(until: Until) -> None:
     with opened(**FREE, rate_hz=100, back_pressure_s=1.0) as camera:
         camera.start()
@@ -231,13 +223,6 @@ def test_a_line_trigger_can_be_set_and_then_nothing_comes_by_itself() -> None:
         assert len(camera.read()) == 0
         camera.stop()
         assert camera.counts.grabbed == 0
-
-
-def test_close_may_come_at_any_time_and_twice() -> None:
-    camera = BaslerCamera(BaslerSettings(**FREE))
-    camera.start()
-    camera.close()
-    camera.close()
 
 
 def test_a_closed_camera_gives_its_descriptors_back_though_an_error_keeps_it() -> None:

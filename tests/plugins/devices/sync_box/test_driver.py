@@ -20,7 +20,7 @@ from sliplab.plugins.devices.sync_box.line import NAME, LineReader, seal, unseal
 from sliplab.plugins.devices.sync_box.port import JOIN_S, TRIES, SyncBoxFault
 from sliplab.plugins.devices.sync_box.settings import SyncBoxSettings
 from sliplab.protocols.timing import Code
-from sliplab.rigs.core.capabilities import RigError, SyncBox
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.pulse_code import code_bits
 
 pytestmark = pytest.mark.realtime
@@ -80,10 +80,6 @@ def fault_of(call: Callable[[], object], bound_s: float) -> str:
     pytest.fail(f"no fault within {bound_s} s")
 
 
-def test_it_is_a_sync_box(box: SerialSyncBox) -> None:
-    assert isinstance(box, SyncBox)
-
-
 @pytest.mark.quick(3)
 @pytest.mark.parametrize("code", CODES)
 @pytest.mark.parametrize("rate_hz", [200.0, 1000.0, 333.333])
@@ -107,12 +103,6 @@ def test_nothing_comes_after_the_stop(box: SerialSyncBox) -> None:
     assert len(box.read_pulses()) == 0
     assert box.read_clock().device_ns[0] > clock, "the clock goes on"
     box.stop()
-
-
-def test_a_new_start_begins_anew(box: SerialSyncBox) -> None:
-    running(box, 200.0, 5)
-    box.start(100.0, SEED, "regular")
-    assert pulses_of(box, 2)[:2].tolist() == [0, 160_000_000]
 
 
 def test_exposures_are_stamped(box: SerialSyncBox) -> None:
@@ -203,16 +193,6 @@ def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -
     wire.silence()
     text = fault_of(getattr(box, ask), TRIES * ANSWER_S)
     assert "start the trial again" in text
-
-
-def test_a_late_answer_is_not_taken_for_that_of_the_next_try(wire: FakeSyncBox, box: Any) -> None:
-    box.connect()
-    first = box.read_clock()
-    wire.answer_late()
-    second = box.read_clock()
-    passed_ns = int(second.device_ns[0] - first.device_ns[0])
-    assert passed_ns >= int(second.before_ns[0] - first.after_ns[0]) - 1000
-    assert passed_ns <= int(second.after_ns[0] - first.before_ns[0]) + 1000
 
 
 def test_one_garbled_answer_is_asked_for_again(wire: FakeSyncBox, box: SerialSyncBox) -> None:
@@ -346,13 +326,6 @@ def test_another_device_answers(wire: FakeSyncBox, box: SerialSyncBox, monkeypat
 def test_a_train_that_cannot_be_sent(box: Any, rate_hz: float, seed: int, word: str) -> None:
     with pytest.raises(RigError, match=word):
         box.start(rate_hz, seed)
-
-
-def test_closing_twice_and_before_opening(box: SerialSyncBox) -> None:
-    box.close()
-    box.start(100.0, SEED)
-    box.close()
-    box.close()
 
 
 CHATTER = {
