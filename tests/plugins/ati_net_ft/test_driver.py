@@ -60,7 +60,7 @@ def settings_for(fake: FakeNetFt, **more: Any) -> AtiNetFtSettings:
     )
 
 
-def gather(sensor: AtiNetFt, rows: int, within_s: float = 5.0) -> list[WrenchChunk]:
+def gather(sensor: AtiNetFt, rows: int, within_s: float = 5.0) -> WrenchChunk:
     """Read until there is enough."""
     found: list[WrenchChunk] = []
 
@@ -69,11 +69,7 @@ def gather(sensor: AtiNetFt, rows: int, within_s: float = 5.0) -> list[WrenchChu
         return sum(map(len, found)) >= rows
 
     until(enough, within_s)
-    return found
-
-
-def times(chunks: list[WrenchChunk]) -> np.ndarray:
-    return np.concatenate([chunk.t_ns for chunk in chunks])
+    return WrenchChunk.concatenate(found)
 
 
 def fault_of(sensor: AtiNetFt, within_s: float) -> str:
@@ -100,17 +96,13 @@ def test_records_come_in_newtons_with_the_sensors_own_time(make: Make) -> None:
     sensor, _ = make(wire={"load": lambda now_ns: load})
     assert len(sensor.read()) == 0
     sensor.start()
-    chunks = gather(sensor, 200)
-    force = np.concatenate([chunk.force_n for chunk in chunks])
-    torque = np.concatenate([chunk.torque_nm for chunk in chunks])
-    assert np.allclose(force, load[:3], atol=1e-6)
-    assert np.allclose(torque, load[3:], atol=1e-6)
-    found = times(chunks)
-    assert found.dtype == np.int64
+    found = gather(sensor, 200)
+    assert np.allclose(found.force_n, load[:3], atol=1e-6)
+    assert np.allclose(found.torque_nm, load[3:], atol=1e-6)
+    assert found.t_ns.dtype == np.int64
     # a thousand records a second, seven ticks of 1/7000 s apart
-    assert np.all(np.abs(np.diff(found) - 1_000_000) <= 150_000)
-    host = np.concatenate([chunk.host_ns for chunk in chunks])
-    assert np.all(np.diff(host) >= 0)
+    assert np.all(np.abs(np.diff(found.t_ns) - 1_000_000) <= 150_000)
+    assert np.all(np.diff(found.host_ns) >= 0)
     sensor.stop()
     assert sensor.describe()["counts"]["lost"] == 0
 
@@ -125,8 +117,8 @@ def test_its_clock_is_bounded_by_arrivals(make: Make) -> None:
 
     sensor, fake = make(wire={"now_ns": clock})
     sensor.start()
-    chunks = gather(sensor, 800)
-    device, host = times(chunks), np.concatenate([chunk.host_ns for chunk in chunks])
+    chunk = gather(sensor, 800)
+    device, host = chunk.t_ns, chunk.host_ns
     longest_ns = 200_000_000  # a busy machine's
     found = fit_bounds(device, host - longest_ns, host, 400.0)
     shown = device[[0, -1]]
@@ -139,7 +131,7 @@ def test_units_and_counts_come_from_its_page(make: Make) -> None:
     load = (10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     sensor, _ = make(wire={"load": lambda now_ns: load, "units": ("lbf", "lbf-in")})
     sensor.start()
-    chunk = gather(sensor, 5)[-1]
+    chunk = gather(sensor, 5)
     assert chunk.force_n[-1, 0] == pytest.approx(10.0, abs=1e-4)
     assert chunk.torque_nm[-1, 2] == pytest.approx(1.0, abs=1e-5)
 
@@ -151,14 +143,14 @@ def test_given_counts_need_no_page(make: Make) -> None:
         counts_per_nm=1e6,
     )
     sensor.start()
-    assert gather(sensor, 5)[-1].force_n[-1, 0] == pytest.approx(2.0)
+    assert gather(sensor, 5).force_n[-1, 0] == pytest.approx(2.0)
 
 
 def test_rate_and_filter_are_written_and_read_back(make: Make) -> None:
     sensor, fake = make(rate_hz=500, filter_hz=73)
     assert (fake.rate_hz, fake.filter_number) == (500, 4)
     sensor.start()
-    found = times(gather(sensor, 50))
+    found = gather(sensor, 50).t_ns
     assert np.median(np.diff(found)) == pytest.approx(2_000_000, abs=150_000)
     described = sensor.describe()
     assert (described["rate_hz"], described["filter_number"]) == (500, 4)
@@ -175,28 +167,30 @@ def test_bias_of_a_session_is_taken_when_it_connects(make: Make) -> None:
     load = (0.0, 0.0, 2.0, 0.0, 0.0, 0.0)
     sensor, _ = make(wire={"load": lambda now_ns: load}, bias="session")
     sensor.start()
-    assert gather(sensor, 5)[-1].force_n[-1, 2] == pytest.approx(0.0)
+    assert gather(sensor, 5).force_n[-1, 2] == pytest.approx(0.0)
 
 
 def test_lost_records_are_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
-    chunks = gather(sensor, 20)
+    chunks = [gather(sensor, 20)]
     fake.inject(SensorFaultKind.LOSS, 7)
-    chunks += gather(sensor, 50)
+    chunks.append(gather(sensor, 50))
     assert sensor.counts.lost == 7
-    assert np.diff(times(chunks)).max() == pytest.approx(8_000_000, abs=150_000)
+    assert np.diff(WrenchChunk.concatenate(chunks).t_ns).max() == pytest.approx(
+        8_000_000, abs=150_000
+    )
 
 
 def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
-    chunks = gather(sensor, 20)
+    chunks = [gather(sensor, 20)]
     fake.inject(SensorFaultKind.REORDER, 3)
-    chunks += gather(sensor, 50)
+    chunks.append(gather(sensor, 50))
     fake.inject(SensorFaultKind.DUPLICATE, 2)
-    chunks += gather(sensor, 50)
-    assert np.all(np.diff(times(chunks)) > 0)
+    chunks.append(gather(sensor, 50))
+    assert np.all(np.diff(WrenchChunk.concatenate(chunks).t_ns) > 0)
     assert (sensor.counts.late, sensor.counts.lost) == (5, 0)
 
 

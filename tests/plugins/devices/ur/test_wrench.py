@@ -29,8 +29,7 @@ def gather(sensor: UrWrench, rows: int) -> WrenchChunk:
         return sum(map(len, parts)) >= rows
 
     until(enough, 5.0)
-    fields = ("t_ns", "host_ns", "force_n", "torque_nm")
-    return WrenchChunk(*(np.concatenate([getattr(p, field) for p in parts]) for field in fields))
+    return WrenchChunk.concatenate(parts)
 
 
 def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
