@@ -7,8 +7,12 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
+
+from sliplab.storage.streams import Chunk
 
 _COUNT = itertools.count(1)
+ChunkT = TypeVar("ChunkT", bound=Chunk)
 
 
 def own_address() -> str:
@@ -17,7 +21,7 @@ def own_address() -> str:
     return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{1 + next(_COUNT) % 250}"
 
 
-def until(condition: Callable[[], bool], within_s: float) -> float:
+def until(condition: Callable[[], object], within_s: float = 60.0) -> float:
     """Wait for a condition; how long it took, s. Fails after `within_s`."""
     began = time.monotonic()
     poll = threading.Event()
@@ -25,3 +29,15 @@ def until(condition: Callable[[], bool], within_s: float) -> float:
         assert time.monotonic() - began < within_s, f"not true within {within_s:g} s"
         poll.wait(0.002)
     return time.monotonic() - began
+
+
+def gather(read: Callable[[], ChunkT], rows: int, within_s: float = 60.0) -> ChunkT:
+    """Read until there are so many rows; return all of them as one chunk."""
+    parts: list[ChunkT] = []
+
+    def enough() -> bool:
+        parts.append(read())
+        return sum(map(len, parts)) >= rows
+
+    until(enough, within_s)
+    return type(parts[0]).concatenate([part for part in parts if len(part)])

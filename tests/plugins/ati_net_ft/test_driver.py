@@ -20,7 +20,7 @@ from sliplab.plugins.ati_net_ft.fake import FakeNetFt, SensorFaultKind
 from sliplab.plugins.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.storage.streams import WrenchChunk
-from tests.rigs.waiting import own_address, until
+from tests.rigs.waiting import gather, own_address, until
 
 pytestmark = pytest.mark.realtime
 
@@ -44,7 +44,7 @@ def make() -> Iterator[Make]:
                 sensor.connect()
             if rows is not None:
                 sensor.start()
-                gather(sensor, rows)
+                gather(sensor.read, rows)
             return sensor, fake
 
         yield build
@@ -58,18 +58,6 @@ def settings_for(fake: FakeNetFt, **more: Any) -> AtiNetFtSettings:
         web_port=fake.web_port,
         **{"answer_s": ANSWER_S, "silence_s": SILENCE_S, **more},
     )
-
-
-def gather(sensor: AtiNetFt, rows: int, within_s: float = 5.0) -> WrenchChunk:
-    """Read until there is enough."""
-    found: list[WrenchChunk] = []
-
-    def enough() -> bool:
-        found.append(sensor.read())
-        return sum(map(len, found)) >= rows
-
-    until(enough, within_s)
-    return WrenchChunk.concatenate(found)
 
 
 def fault_of(sensor: AtiNetFt, within_s: float) -> str:
@@ -96,7 +84,7 @@ def test_records_come_in_newtons_with_the_sensors_own_time(make: Make) -> None:
     sensor, _ = make(wire={"load": lambda now_ns: load})
     assert len(sensor.read()) == 0
     sensor.start()
-    found = gather(sensor, 200)
+    found = gather(sensor.read, 200)
     assert np.allclose(found.force_n, load[:3], atol=1e-6)
     assert np.allclose(found.torque_nm, load[3:], atol=1e-6)
     assert found.t_ns.dtype == np.int64
@@ -117,7 +105,7 @@ def test_its_clock_is_bounded_by_arrivals(make: Make) -> None:
 
     sensor, fake = make(wire={"now_ns": clock})
     sensor.start()
-    chunk = gather(sensor, 800)
+    chunk = gather(sensor.read, 800)
     device, host = chunk.t_ns, chunk.host_ns
     longest_ns = 200_000_000  # a busy machine's
     found = fit_bounds(device, host - longest_ns, host, 400.0)
@@ -131,7 +119,7 @@ def test_units_and_counts_come_from_its_page(make: Make) -> None:
     load = (10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     sensor, _ = make(wire={"load": lambda now_ns: load, "units": ("lbf", "lbf-in")})
     sensor.start()
-    chunk = gather(sensor, 5)
+    chunk = gather(sensor.read, 5)
     assert chunk.force_n[-1, 0] == pytest.approx(10.0, abs=1e-4)
     assert chunk.torque_nm[-1, 2] == pytest.approx(1.0, abs=1e-5)
 
@@ -143,14 +131,14 @@ def test_given_counts_need_no_page(make: Make) -> None:
         counts_per_nm=1e6,
     )
     sensor.start()
-    assert gather(sensor, 5).force_n[-1, 0] == pytest.approx(2.0)
+    assert gather(sensor.read, 5).force_n[-1, 0] == pytest.approx(2.0)
 
 
 def test_rate_and_filter_are_written_and_read_back(make: Make) -> None:
     sensor, fake = make(rate_hz=500, filter_hz=73)
     assert (fake.rate_hz, fake.filter_number) == (500, 4)
     sensor.start()
-    found = gather(sensor, 50).t_ns
+    found = gather(sensor.read, 50).t_ns
     assert np.median(np.diff(found)) == pytest.approx(2_000_000, abs=150_000)
     described = sensor.describe()
     assert (described["rate_hz"], described["filter_number"]) == (500, 4)
@@ -167,15 +155,15 @@ def test_bias_of_a_session_is_taken_when_it_connects(make: Make) -> None:
     load = (0.0, 0.0, 2.0, 0.0, 0.0, 0.0)
     sensor, _ = make(wire={"load": lambda now_ns: load}, bias="session")
     sensor.start()
-    assert gather(sensor, 5).force_n[-1, 2] == pytest.approx(0.0)
+    assert gather(sensor.read, 5).force_n[-1, 2] == pytest.approx(0.0)
 
 
 def test_lost_records_are_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
-    chunks = [gather(sensor, 20)]
+    chunks = [gather(sensor.read, 20)]
     fake.inject(SensorFaultKind.LOSS, 7)
-    chunks.append(gather(sensor, 50))
+    chunks.append(gather(sensor.read, 50))
     assert sensor.counts.lost == 7
     assert np.diff(WrenchChunk.concatenate(chunks).t_ns).max() == pytest.approx(
         8_000_000, abs=150_000
@@ -185,11 +173,11 @@ def test_lost_records_are_counted(make: Make) -> None:
 def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
     sensor, fake = make()
     sensor.start()
-    chunks = [gather(sensor, 20)]
+    chunks = [gather(sensor.read, 20)]
     fake.inject(SensorFaultKind.REORDER, 3)
-    chunks.append(gather(sensor, 50))
+    chunks.append(gather(sensor.read, 50))
     fake.inject(SensorFaultKind.DUPLICATE, 2)
-    chunks.append(gather(sensor, 50))
+    chunks.append(gather(sensor.read, 50))
     assert np.all(np.diff(WrenchChunk.concatenate(chunks).t_ns) > 0)
     assert (sensor.counts.late, sensor.counts.lost) == (5, 0)
 
@@ -197,7 +185,7 @@ def test_a_late_record_and_a_double_are_dropped_and_counted(make: Make) -> None:
 def test_what_is_no_record_is_counted(make: Make) -> None:
     sensor, fake = make(rows=5)
     fake.inject(SensorFaultKind.MALFORMED, 2)
-    gather(sensor, 20)
+    gather(sensor.read, 20)
     assert (sensor.counts.malformed, sensor.counts.lost) == (2, 2)
 
 
@@ -209,7 +197,7 @@ def test_silence_is_a_fault(make: Make) -> None:
         sensor.read()
     fake.restore()
     sensor.start()
-    gather(sensor, 5)
+    gather(sensor.read, 5)
 
 
 def test_a_saturated_sensor_is_a_fault(make: Make) -> None:

@@ -10,26 +10,13 @@ import pytest
 from sliplab.plugins.devices.ur import WRENCH_DRIVER
 from sliplab.plugins.devices.ur.rtde import OUTPUTS
 from sliplab.plugins.devices.ur.settings import UrWrenchSettings
-from sliplab.plugins.devices.ur.wrench import UrWrench
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.storage.streams import WrenchChunk
 from tests.plugins.devices.conftest import MakeUr
-from tests.rigs.waiting import until
+from tests.rigs.waiting import gather, until
 
 pytestmark = pytest.mark.realtime
-
-
-def gather(sensor: UrWrench, rows: int) -> WrenchChunk:
-    parts: list[WrenchChunk] = []
-
-    def enough() -> bool:
-        parts.append(sensor.read())
-        return sum(map(len, parts)) >= rows
-
-    until(enough, 5.0)
-    return WrenchChunk.concatenate(parts)
 
 
 def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
@@ -43,7 +30,7 @@ def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
     assert len(sensor.read()) == 0
     arm.read_poses()
     sensor.start()
-    found = gather(sensor, 40)
+    found = gather(sensor.read, 40)
     poses = arm.read_poses()
     assert np.all(np.diff(found.t_ns) == 8_000_000)
     assert np.isin(found.t_ns, poses.t_ns).all()
@@ -60,7 +47,7 @@ def test_the_plates_reaction_is_the_force_on_the_plate(ur_pair: MakeUr) -> None:
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     arm.connect()
     sensor.start()
-    on_plate = np.array(frame.force_matrix(sensor.mounting)) @ gather(sensor, 3).force_n[-1]
+    on_plate = np.array(frame.force_matrix(sensor.mounting)) @ gather(sensor.read, 3).force_n[-1]
     assert on_plate == pytest.approx([0.5, 0.0, 3.0], abs=1e-9)
 
 
@@ -71,7 +58,7 @@ def test_zero_takes_the_load_away(ur_pair: MakeUr) -> None:
     arm.connect()
     sensor.connect()
     sensor.start()
-    assert gather(sensor, 10).force_n[-1] == pytest.approx([0.0, 0.0, 0.0])
+    assert gather(sensor.read, 10).force_n[-1] == pytest.approx([0.0, 0.0, 0.0])
     assert robot.program.refused == []
 
 
@@ -82,7 +69,7 @@ def test_a_lost_link_is_a_fault(ur_pair: MakeUr) -> None:
         sensor.connect()
     arm.connect()
     sensor.start()
-    gather(sensor, 5)
+    gather(sensor.read, 5)
     robot.inject(Kind.LINK_CUT)
 
     def lost() -> bool:
