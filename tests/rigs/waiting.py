@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.streams import Chunk
 
 _COUNT = itertools.count(1)
@@ -41,3 +43,25 @@ def gather(read: Callable[[], ChunkT], rows: int, within_s: float = 60.0) -> Chu
 
     until(enough, within_s)
     return type(parts[0]).concatenate([part for part in parts if len(part)])
+
+
+def fault_of(call: Callable[[], object], within_s: float) -> str:
+    """Call again and again; return the text of the fault in which that ends in time."""
+    found: list[str] = []
+
+    def fails() -> bool:
+        try:
+            call()
+        except RigError as fault:
+            found.append(str(fault))
+        return bool(found)
+
+    until(fails, within_s)
+    return found[0]
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of this host that nobody has now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -20,7 +20,7 @@ from sliplab.plugins.ati_net_ft.fake import FakeNetFt, SensorFaultKind
 from sliplab.plugins.ati_net_ft.settings import AtiNetFtSettings
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.storage.streams import WrenchChunk
-from tests.rigs.waiting import gather, own_address, until
+from tests.rigs.waiting import fault_of, gather, own_address, until
 
 pytestmark = pytest.mark.realtime
 
@@ -58,18 +58,6 @@ def settings_for(fake: FakeNetFt, **more: Any) -> AtiNetFtSettings:
         web_port=fake.web_port,
         **{"answer_s": ANSWER_S, "silence_s": SILENCE_S, **more},
     )
-
-
-def fault_of(sensor: AtiNetFt, within_s: float) -> str:
-    """The text of the fault in which reading ends within a bound."""
-    begin = time.monotonic()
-    while time.monotonic() - begin < within_s + SLACK_S:
-        try:
-            sensor.read()
-        except RigError as fault:
-            return str(fault)
-        threading.Event().wait(0.005)
-    pytest.fail(f"no fault within {within_s} s")
 
 
 def test_it_is_a_force_sensor(make: Make) -> None:
@@ -192,7 +180,7 @@ def test_what_is_no_record_is_counted(make: Make) -> None:
 def test_silence_is_a_fault(make: Make) -> None:
     sensor, fake = make(rows=5)
     fake.inject(SensorFaultKind.SILENCE)
-    assert "nothing came for 0.3 s" in fault_of(sensor, SILENCE_S)
+    assert "nothing came for 0.3 s" in fault_of(sensor.read, SILENCE_S + SLACK_S)
     with pytest.raises(RigError, match="nothing came"):
         sensor.read()
     fake.restore()
@@ -203,13 +191,13 @@ def test_silence_is_a_fault(make: Make) -> None:
 def test_a_saturated_sensor_is_a_fault(make: Make) -> None:
     sensor, fake = make(rows=5)
     fake.inject(SensorFaultKind.SATURATED)
-    assert "0xC0000000: force or torque out of range" in fault_of(sensor, 0.5)
+    assert "0xC0000000: force or torque out of range" in fault_of(sensor.read, 0.5 + SLACK_S)
 
 
 def test_a_sensor_that_begins_anew_is_a_fault(make: Make) -> None:
     sensor, fake = make(wire={"ticks": 10**6}, rows=5)
     fake.inject(SensorFaultKind.RESTART)
-    assert "it restarted" in fault_of(sensor, 0.5)
+    assert "it restarted" in fault_of(sensor.read, 0.5 + SLACK_S)
 
 
 def test_a_sensor_that_is_not_there_is_named_within_its_bound(make: Make) -> None:

@@ -14,7 +14,7 @@ from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.plate_frame import PlateFrame
 from tests.plugins.devices.conftest import MakeUr
-from tests.rigs.waiting import gather, until
+from tests.rigs.waiting import fault_of, gather
 
 pytestmark = pytest.mark.realtime
 
@@ -71,15 +71,7 @@ def test_a_lost_link_is_a_fault(ur_pair: MakeUr) -> None:
     sensor.start()
     gather(sensor.read, 5)
     robot.inject(Kind.LINK_CUT)
-
-    def lost() -> bool:
-        try:
-            sensor.read()
-        except RigError:
-            return True
-        return False
-
-    until(lost, 5.0)
+    fault_of(sensor.read, 5.0)
 
 
 def test_an_arm_without_it_is_asked_for_nothing_more(ur_pair: MakeUr) -> None:
