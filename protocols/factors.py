@@ -30,10 +30,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 Level = Decimal | str
 
 
-def _number(raw: object) -> Decimal:
-    return to_decimal(raw)
-
-
 _DIGITS = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
 _QUANTITY = {
     "type": "string",
@@ -42,7 +38,7 @@ _QUANTITY = {
 }
 Number = Annotated[
     Decimal,
-    BeforeValidator(_number),
+    BeforeValidator(to_decimal),
     PlainSerializer(canonical),
     WithJsonSchema({"anyOf": [{"type": "number"}, _QUANTITY]}),
 ]
@@ -99,19 +95,14 @@ def _write_level(level: Level) -> str:
     return level if isinstance(level, str) else canonical(level)
 
 
+def _schema(text: re.Pattern[str]) -> WithJsonSchema:
+    """Return the JSON Schema of a level that is a number, or text of a pattern."""
+    words = {"type": "string", "pattern": f"^{text.pattern}$"}
+    return WithJsonSchema({"anyOf": [{"type": "number"}, _QUANTITY, words]})
+
+
 LevelField = Annotated[
-    Level,
-    BeforeValidator(_level),
-    PlainSerializer(_write_level),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {"type": "number"},
-                _QUANTITY,
-                {"type": "string", "pattern": f"^{_WORD.pattern}$"},
-            ]
-        }
-    ),
+    Level, BeforeValidator(_level), PlainSerializer(_write_level), _schema(_WORD)
 ]
 
 
@@ -128,18 +119,7 @@ def _named(raw: object) -> Level:
 
 
 ContextLevel = Annotated[
-    Level,
-    BeforeValidator(_named),
-    PlainSerializer(_write_level),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {"type": "number"},
-                _QUANTITY,
-                {"type": "string", "pattern": f"^{_NAME.pattern}$"},
-            ]
-        }
-    ),
+    Level, BeforeValidator(_named), PlainSerializer(_write_level), _schema(_NAME)
 ]
 
 

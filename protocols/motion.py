@@ -44,6 +44,8 @@ from sliplab.protocols.yaml_file import raise_all
 
 Condition = Mapping[str, Level]
 _ByArm = ArmMotion | Rotation | Regrasp
+_FAR_MM = Decimal(10_000)
+"""Longer ways are refused by themselves; where others lead, the workspace limits."""
 UNTWIST_DEG_S = 20.0
 """Speed at which a sensor that was twisted turns back, clear of the plate."""
 
@@ -246,7 +248,10 @@ def _limit_faults(
             return
         yield from written.get(field.factor, ())  # an unknown factor is named by another rule
 
-    def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> Iterator[KeyedError]:
+    def at_most(
+        field: Any, key: str, name: str, unit: str = "mm", limit: Decimal | None = None
+    ) -> Iterator[KeyedError]:
+        limit = getattr(limits, name) if limit is None else limit
         for value, where in levels(field, key):
             if value > limit:
                 yield KeyedError(
@@ -263,40 +268,31 @@ def _limit_faults(
         if isinstance(phase, TwistPhase):
             yield from _check_twist(phase, base, levels, limits)
         elif not isinstance(phase, (HoldPhase, PlateMotion)):
-            yield from at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+            yield from at_most(phase.speed, f"{base}.speed", "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
-            yield from at_most(
-                phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
-            )
+            yield from at_most(phase.clearance, f"{base}.clearance", "clearance")
         if isinstance(phase, Press) and phase.depth is not None:
-            yield from at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
+            yield from at_most(phase.depth, f"{base}.depth", "depth")
         if isinstance(phase, Slide):
-            yield from at_most(
-                phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm"
-            )
+            yield from at_most(phase.distance, f"{base}.distance", "workspace", limit=_FAR_MM)
             yield from _check_slide(phase, base, levels, limits)
         if isinstance(phase, Travel) and phase.to is not None:
             yield from _check_place(phase.to, f"{base}.to", levels, limits)
         if isinstance(phase, Retract):
-            yield from at_most(
-                phase.distance, f"{base}.distance", Decimal(10_000), "clearance", "mm"
-            )
+            yield from at_most(phase.distance, f"{base}.distance", "clearance", limit=_FAR_MM)
             yield from _check_retract(phase, base, levels, limits)
     if collection.maintenance.warm_up is not None:
         warm_up, base = collection.maintenance.warm_up, "collection.maintenance.warm_up"
-        yield from at_most(warm_up.depth, f"{base}.depth", limits.depth, "depth", "mm")
-        yield from at_most(warm_up.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
-        yield from at_most(
-            warm_up.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
-        )
+        yield from at_most(warm_up.depth, f"{base}.depth", "depth")
+        yield from at_most(warm_up.speed, f"{base}.speed", "speed", "mm/s")
+        yield from at_most(warm_up.clearance, f"{base}.clearance", "clearance")
     if collection.maintenance.rezero is not None:
         rezero, base = collection.maintenance.rezero, "collection.maintenance.rezero"
-        yield from at_most(rezero.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
-        yield from at_most(rezero.search, f"{base}.search", limits.depth, "depth", "mm")
+        yield from at_most(rezero.speed, f"{base}.speed", "speed", "mm/s")
+        yield from at_most(rezero.search, f"{base}.search", "depth")
     if collection.plate is not None:
-        yield from at_most(
-            collection.plate.mass, "collection.plate.mass", Decimal(5), "mass (fixed)", "kg"
-        )
+        key = "collection.plate.mass"
+        yield from at_most(collection.plate.mass, key, "mass (fixed)", "kg", Decimal(5))
 
 
 def _check_levels(

@@ -50,11 +50,14 @@ class _Nuisance(StrictModel):
     """The field that is proportional to the strength."""
     by_arm: ClassVar[bool] = False
     """The arm makes it, in the hold."""
+    asks: ClassVar[str] = ""
+    """What the operator of a real rig is asked for, with fields in braces."""
 
     @property
     def request(self) -> str:
         """Instruction for the operator of a real rig; empty if the arm does it."""
-        return ""
+        values = {key: canonical(v) if isinstance(v, Decimal) else v for key, v in self}
+        return self.asks.format(**values)
 
     def scaled(self, share: Decimal) -> Any:
         """Return the same at another strength, 1 for its own."""
@@ -76,10 +79,10 @@ class Tap(_Nuisance):
 
     @property
     def request(self) -> str:
-        """See `_Nuisance`."""
+        """Instruction for the operator of a real rig; the way in micrometres."""
         return (
             f"knock on the {self.on} about every {canonical(self.every)} s, so that it moves by "
-            f"{_um(self.distance)}"
+            f"{canonical(self.distance * 1000)} um"
         )
 
 
@@ -90,6 +93,9 @@ class VibrationNuisance(_Nuisance):
     """
 
     scales = "speed"
+    asks = (
+        "shake the table by a sweep from {low} to {high} Hz in {sweep} s, peak speed {speed} mm/s"
+    )
     kind: Literal["vibration"]
     speed: PositiveSpeed
     """Peak speed."""
@@ -97,14 +103,6 @@ class VibrationNuisance(_Nuisance):
     high: PositiveHertz = Decimal(200)
     sweep: PositiveSeconds = Decimal(10)
     """Time from `low` to `high`."""
-
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return (
-            f"shake the table by a sweep from {canonical(self.low)} to {canonical(self.high)} Hz "
-            f"in {canonical(self.sweep)} s, peak speed {canonical(self.speed)} mm/s"
-        )
 
 
 class ArmMotion(_Nuisance):
@@ -144,25 +142,19 @@ class FlickerNuisance(_Nuisance):
     """Lamps on the mains, with light that gets into the sensor."""
 
     scales = "share"
+    asks = "light the sensor by a lamp that flickers at {frequency} Hz by {share} %"
     kind: Literal["flicker"]
     share: PositivePercent
     """Amplitude of the intensity over its mean."""
     frequency: PositiveHertz = Decimal(100)
     """Twice that of the mains."""
 
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return (
-            f"light the sensor by a lamp that flickers at {canonical(self.frequency)} Hz by "
-            f"{canonical(self.share)} %"
-        )
-
 
 class Brush(_Nuisance):
     """Another object brushes over the papillae from the side, one after the other."""
 
     scales = "force"
+    asks = "brush over the skin's rim about every {every} s with {force} N"
     kind: Literal["brush"]
     force: PositiveNewtons
     """Largest side force on a papilla."""
@@ -171,56 +163,36 @@ class Brush(_Nuisance):
     """Standard deviation of the force along its way."""
     every: PositiveSeconds = Decimal(3)
 
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return (
-            f"brush over the skin's rim about every {canonical(self.every)} s with "
-            f"{canonical(self.force)} N"
-        )
-
 
 class LostPackets(_Nuisance):
     """Packets of the event camera that get lost, events and sync pulses with them."""
 
     scales = "duration"
+    asks = "load the event camera's link so that packets get lost"
     kind: Literal["lost_packets"]
     duration: PositiveSeconds
     """What one packet holds."""
     every: PositiveSeconds = Decimal("0.5")
-
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return "load the event camera's link so that packets get lost"
 
 
 class HotPixels(_Nuisance):
     """More pixels that send events without a change of light."""
 
     scales = "rate"
+    asks = "raise the event camera's bias until more hot pixels appear"
     kind: Literal["hot_pixels"]
     pixels: Annotated[int, Field(ge=1, le=1_000_000)]
     rate: PositiveHertz
     """Mean rate of events of each."""
-
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return "raise the event camera's bias until more hot pixels appear"
 
 
 class Warmth(_Nuisance):
     """A warmer event camera: its noise doubles with every 8 degC."""
 
     scales = "rise"
+    asks = "warm the event camera by {rise} degC"
     kind: Literal["warmth"]
     rise: PositiveCelsius
-
-    @property
-    def request(self) -> str:
-        """See `_Nuisance`."""
-        return f"warm the event camera by {canonical(self.rise)} degC"
 
 
 AnyNuisance = (
@@ -329,7 +301,3 @@ class TrialNuisances:
 def requests(elements: tuple[AnyNuisance, ...]) -> str:
     """Instruction for the operator; empty if the arm does it all."""
     return "; ".join(each.request for each in elements if each.request)
-
-
-def _um(mm: Decimal) -> str:
-    return f"{canonical(mm * 1000)} um"

@@ -10,9 +10,16 @@ import numpy.typing as npt
 
 from sliplab.analysis.metrics.classification import CLASSES, score
 from sliplab.analysis.networks.training import Fitted
-from sliplab.plugins.deploy.document import CardData, CardModel, ModelCard, ModelFile, SplitFigures
+from sliplab.plugins.deploy.document import (
+    CardData,
+    CardModel,
+    ModelCard,
+    ModelFile,
+    SplitFigures,
+    WindowCost,
+)
 from sliplab.protocols.shown import plural
-from sliplab.storage.schema.evaluation import Latencies, WindowCost, WindowWork
+from sliplab.storage.schema.evaluation import Latencies, WindowWork
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10

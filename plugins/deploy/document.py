@@ -15,11 +15,27 @@ from sliplab.storage.schema.evaluation import (
     Classification,
     CountChange,
     Latencies,
-    WindowCost,
 )
 
 _whole = PlainSerializer(lambda settings: settings.model_dump(mode="json"))
 """All settings, the defaults too."""
+
+
+class WindowCost(Part):
+    """Means over windows, by layer; the last of each sum is `all`."""
+
+    windows: Int
+    events_a_window: Number
+    rates: dict[str, Number]
+    """Spikes per neuron and step."""
+    synaptic_operations: dict[str, Number]
+    dense_multiply_adds: dict[str, Int]
+    """Without looking at zeros."""
+    share_of_dense: Number
+    footprint_bytes: Int | None = None
+    connection_sparsity: Number | None = None
+    activation_sparsity: Number | None = None
+    """These three: see `storage.schema.evaluation.WindowWork`."""
 
 
 class ModelFile(Part):

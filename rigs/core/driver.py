@@ -152,21 +152,25 @@ class ArmDriver(Driver[ArmSettingsT]):
         return (measures and self.build_measuring) or self.build
 
 
-class FakeEventCamera(Protocol):
-    """A fake event camera that sends the events of a simulated scene."""
+class Fake(Protocol):
+    """A fake of a device, which a driver reaches by its address."""
 
     @property
     def address(self) -> Any:
-        """Address for the driver, used by `EventCameraDriver.reach`; it can be pickled."""
+        """Address for the driver, used by its `reach`; it can be pickled."""
+
+    def close(self) -> None:
+        """Break the connections, as an unplugged cable would; safe to call more than once."""
+
+
+class FakeEventCamera(Fake, Protocol):
+    """A fake event camera that sends the events of a simulated scene."""
 
     def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
         """Send events and rising edges of the input; nothing while stalled."""
 
     def stall(self) -> None:
         """Stop sending; the connection stays open."""
-
-    def close(self) -> None:
-        """Break the connections, as an unplugged cable would; safe to call more than once."""
 
 
 @dataclass(frozen=True)
@@ -222,15 +226,11 @@ class PulseTrain:
     code: Code
 
 
-class FakeBox(Protocol):
+class FakeBox(Fake, Protocol):
     """A fake sync box, which sends its pulses by itself."""
 
     pulses: int
     """Number of pulses of the running or last train."""
-
-    @property
-    def address(self) -> Any:
-        """Address for the driver, used by `SyncBoxDriver.reach`; it can be pickled."""
 
     def reset(self) -> None:
         """Restart as after a brown-out: no train, and a restarted clock."""
@@ -240,9 +240,6 @@ class FakeBox(Protocol):
 
     def answer_late(self) -> None:
         """Hold the answer to the next request back until the one after it."""
-
-    def close(self) -> None:
-        """Unplug it; safe to call more than once."""
 
 
 OnTrain = Callable[[PulseTrain | None, int], None]
@@ -263,12 +260,8 @@ class SyncBoxDriver(Driver[SettingsT]):
     it has some."""
 
 
-class FakeForceSensor(Protocol):
+class FakeForceSensor(Fake, Protocol):
     """A force sensor on a wire, that sends what a simulated scene shows."""
-
-    @property
-    def address(self) -> Any:
-        """Address for the driver, used by `ForceSensorDriver.reach`; it can be pickled."""
 
     def send(self, chunk: WrenchChunk) -> None:
         """Send samples of the plate's load, in the sensor's axes and clock."""
@@ -278,9 +271,6 @@ class FakeForceSensor(Protocol):
 
     def silence(self) -> None:
         """Send nothing from now on."""
-
-    def close(self) -> None:
-        """Unplug it; any number of times."""
 
 
 @dataclass(frozen=True)
@@ -311,21 +301,14 @@ class GripperScene:
     """Time by which the fingers move, ns."""
 
 
-class FakeGripper(Protocol):
+class FakeGripper(Fake, Protocol):
     """A gripper on a wire, whose fingers are a simulated scene's."""
-
-    @property
-    def address(self) -> Any:
-        """Address for the driver, used by `GripperDriver.reach`; it can be pickled."""
 
     def silence(self) -> None:
         """Hang: answer nothing from now on."""
 
     def fail(self) -> None:
         """Report a fault from now on, and stop."""
-
-    def close(self) -> None:
-        """Unplug it; safe to call more than once."""
 
 
 @dataclass(frozen=True)
@@ -343,24 +326,17 @@ class GripperDriver(Driver[GripperSettingsT]):
     """Return settings that reach a fake at an address."""
 
 
-class FakeSensor(Protocol):
+class FakeSensor(Fake, Protocol):
     """A fake sensor that sends rows of numbers."""
 
     clocked: bool
     """Its rows have the times of a clock of its own, which must not fall back."""
-
-    @property
-    def address(self) -> Any:
-        """Address for the driver, used by `SensorDriver.reach`."""
 
     def send(self, rows: Mapping[str, Any]) -> None:
         """Send rows: arrays (n,) of times `t`, ns, and of each column by its stored name."""
 
     def silence(self) -> None:
         """Send nothing from now on."""
-
-    def close(self) -> None:
-        """Unplug it; any number of times."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any, Self, TypeVar
 
 from sliplab.rigs.core.capabilities import Pose
@@ -393,16 +394,11 @@ class ServedController(FakeController):
     fault happen in `_inject`; both run in the loop.
     """
 
-    def __init__(
-        self,
-        host: str,
-        motion: StraightMotion | None = None,
-        clock: ControllerClock | None = None,
-        rate: float = 1.0,
-    ) -> None:
-        super().__init__(host, motion, clock, rate)
-        self._connections = Connections()
-        self._thread: LoopThread | None = None
+    _thread: LoopThread | None = None
+
+    @cached_property
+    def _connections(self) -> Connections:
+        return Connections()
 
     def start(self) -> None:
         """Open the ports and run. Raises OSError if one of them is taken."""

@@ -1,8 +1,8 @@
 """The table of faults: of simulated devices, and of the fakes that real drivers speak to.
 
-Each kind of fault is a model: its name, its meaning, its parameters and the devices that have it.
-Simulated devices have those of `AnyFault` at times that a rig file names (`mock: faults: [...]`);
-docs/faults.md lists them for users. Fakes have those `on_wire`, which tests inject at once.
+A kind of fault of simulated devices is a model: its name, its meaning, its parameters and the
+devices that have it, at times that a rig file names (`mock: faults: [...]`); docs/faults.md lists
+them for users. Fakes have those `on_wire`, and further ones, which tests inject at once.
 Cheap to import, as all settings are.
 """
 
@@ -366,113 +366,6 @@ class StreamGone(_TimedFault):
     """If left out, the device is gone for good."""
 
 
-@on_wire(
-    arm=INJECT, sync_box="silence", force_sensor="silence", gripper="silence", ati_net_ft=INJECT
-)
-class DeviceSilent(BaseFault):
-    """A device answers and sends nothing more; its connections stay open, new ones are accepted."""
-
-    kind: Literal["device_silent"]
-
-
-@on_wire(arm=INJECT, sync_box="answer_late")
-class AnswerLate(BaseFault):
-    """The answer to the next request comes only with the answer to the one after it."""
-
-    kind: Literal["answer_late"]
-
-
-@on_wire(arm=INJECT)
-class PosesLost(BaseFault):
-    """The next `rigs.core.fakes.PACKETS_LOST` packets of poses are not sent."""
-
-    kind: Literal["poses_lost"]
-
-
-@on_wire(arm=INJECT)
-class ArmEmergencyStop(BaseFault):
-    """Somebody presses the emergency stop."""
-
-    kind: Literal["arm_emergency_stop"]
-
-
-@on_wire(arm=INJECT)
-class ArmSafeguardStop(BaseFault):
-    """A light curtain or a door stops the arm; a running program is paused."""
-
-    kind: Literal["arm_safeguard_stop"]
-
-
-@on_wire(arm=INJECT)
-class ArmPowerOff(BaseFault):
-    """The operator switches the arm off, but not its controller."""
-
-    kind: Literal["arm_power_off"]
-
-
-@on_wire(arm=INJECT)
-class ArmRemoteOff(BaseFault):
-    """The operator takes remote control away."""
-
-    kind: Literal["arm_remote_off"]
-
-
-@on_wire(arm=INJECT)
-class ArmProgramEnd(BaseFault):
-    """The operator presses stop at the pendant."""
-
-    kind: Literal["arm_program_end"]
-
-
-@on_wire(arm=INJECT)
-class ArmProgramPaused(BaseFault):
-    """The operator presses pause at the pendant."""
-
-    kind: Literal["arm_program_paused"]
-
-
-@on_wire(force_sensor="overload", ati_net_ft=INJECT)
-class ForceOverload(BaseFault):
-    """The load is out of a force sensor's range; of some records where they are counted."""
-
-    kind: Literal["force_overload"]
-
-
-@on_wire(ati_net_ft=INJECT)
-class RecordsLost(BaseFault):
-    """Records of a force sensor do not arrive."""
-
-    kind: Literal["records_lost"]
-
-
-@on_wire(ati_net_ft=INJECT)
-class RecordsReordered(BaseFault):
-    """A record of a force sensor comes after the one that follows it."""
-
-    kind: Literal["records_reordered"]
-
-
-@on_wire(ati_net_ft=INJECT)
-class RecordsDuplicated(BaseFault):
-    """Records of a force sensor come twice."""
-
-    kind: Literal["records_duplicated"]
-
-
-@on_wire(ati_net_ft=INJECT)
-class RecordsMalformed(BaseFault):
-    """Datagrams of a force sensor are cut short."""
-
-    kind: Literal["records_malformed"]
-
-
-@on_wire(gripper="fail")
-class GripperFault(BaseFault):
-    """A gripper reports a fault."""
-
-    kind: Literal["gripper_fault"]
-
-
 AnyFault = (
     ArmProtectiveStop
     | ArmOffPath
@@ -518,10 +411,44 @@ KINDS: tuple[str, ...] = tuple(kind_of(model) for model in get_args(AnyFault))
 register_tags(*KINDS)
 
 
+_IN_FAKES: Mapping[str, Mapping[str, str]] = {
+    # it answers and sends nothing more; its connections stay open, new ones are accepted
+    "device_silent": {
+        "arm": INJECT,
+        "ati_net_ft": INJECT,
+        **dict.fromkeys(("sync_box", "force_sensor", "gripper"), "silence"),
+    },
+    # the answer to the next request comes only with the answer to the one after it
+    "answer_late": {"arm": INJECT, "sync_box": "answer_late"},
+    # the next `rigs.core.fakes.PACKETS_LOST` packets of poses are not sent
+    "poses_lost": {"arm": INJECT},
+    # somebody presses the emergency stop
+    "arm_emergency_stop": {"arm": INJECT},
+    # a light curtain or a door stops the arm; a running program is paused
+    "arm_safeguard_stop": {"arm": INJECT},
+    # the operator switches the arm off, but not its controller
+    "arm_power_off": {"arm": INJECT},
+    # the operator takes remote control away
+    "arm_remote_off": {"arm": INJECT},
+    # the operator presses stop, or pause, at the pendant
+    "arm_program_end": {"arm": INJECT},
+    "arm_program_paused": {"arm": INJECT},
+    # the load is out of a force sensor's range; of some records where they are counted
+    "force_overload": {"force_sensor": "overload", "ati_net_ft": INJECT},
+    # records of a force sensor do not arrive, come after the next one, or twice, or cut short
+    "records_lost": {"ati_net_ft": INJECT},
+    "records_reordered": {"ati_net_ft": INJECT},
+    "records_duplicated": {"ati_net_ft": INJECT},
+    "records_malformed": {"ati_net_ft": INJECT},
+    "gripper_fault": {"gripper": "fail"},
+}
+"""Kinds that only fakes have, with what `BaseFault.wired` says of the others."""
+
+
 def wired(device: str) -> dict[str, str]:
     """Return the faults of a device's fakes: by kind, the method of the fake that causes it."""
-    models = [*get_args(AnyFault), *BaseFault.__subclasses__()]
-    return {kind_of(it): it.wired[device] for it in models if device in it.wired}
+    every = {**{kind_of(it): it.wired for it in get_args(AnyFault)}, **_IN_FAKES}
+    return {kind: methods[device] for kind, methods in every.items() if device in methods}
 
 
 def check_papillae(faults: tuple[AnyFault, ...], count: int) -> None:

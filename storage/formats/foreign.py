@@ -325,8 +325,8 @@ def inside(chunk: EventChunk, size: tuple[int, int] | None) -> EventChunk:
     left_out = Counter(left_out_of(chunk))
     left_out[OUTSIDE] += len(good) - int(good.sum())
     resolution = chunk.resolution_us if isinstance(chunk, ForeignChunk) else 0.0
-    x, y, p, t_us = chunk.x[good], chunk.y[good], chunk.p[good], chunk.t_us[good]
-    return ForeignChunk(x, y, p, t_us, left_out, resolution)
+    part = chunk[good]
+    return ForeignChunk(part.x, part.y, part.p, part.t_us, left_out, resolution)
 
 
 def left_out_of(chunk: EventChunk) -> Mapping[str, int]:

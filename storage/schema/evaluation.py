@@ -638,20 +638,3 @@ class CountChange(Part):
     mean_change: Number
     """Of a count."""
     largest_change: Int
-
-
-class WindowCost(Part):
-    """Means over windows, by layer; the last of each sum is `all`."""
-
-    windows: Int
-    events_a_window: Number
-    rates: dict[str, Number]
-    """Spikes per neuron and step."""
-    synaptic_operations: dict[str, Number]
-    dense_multiply_adds: dict[str, Int]
-    """Without looking at zeros."""
-    share_of_dense: Number
-    footprint_bytes: Int | None = None
-    connection_sparsity: Number | None = None
-    activation_sparsity: Number | None = None
-    """These three: see `WindowWork`."""

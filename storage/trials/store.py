@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -359,11 +360,7 @@ class Campaign:
         return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
 
     def _count(self, wanted: Callable[[QuarantineEntry], bool]) -> dict[str, int]:
-        counts: dict[str, int] = {}
-        for item in self.quarantined():
-            if wanted(item):
-                counts[item["trial"]] = counts.get(item["trial"], 0) + 1
-        return counts
+        return Counter(item["trial"] for item in self.quarantined() if wanted(item))
 
     def add_bench_record(self, data: SessionRecord) -> None:
         """Store the operator and equipment of one session."""

@@ -16,6 +16,7 @@ import pytest
 
 from tests.command_line import MANY
 from tests.conftest import ROOT
+from tests.packages import write_metadata
 
 EXAMPLES = ROOT / "examples"
 sys.path.append(str(EXAMPLES / "prophesee"))
@@ -66,15 +67,7 @@ class Lab:
 def install(package: str, site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Install a package by what an installer writes, for one test."""
     project = tomllib.loads((EXAMPLES / package / "pyproject.toml").read_text())["project"]
-    info = site / f"{package.replace('-', '_')}-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.1.0\n")
-    lines = [
-        line
-        for group, points in project["entry-points"].items()
-        for line in (f"[{group}]", *(f"{name} = {place}" for name, place in points.items()))
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines))
+    write_metadata(site, package, project["entry-points"], "0.1.0")
     for folder in (site, EXAMPLES / package):
         monkeypatch.syspath_prepend(str(folder))
 

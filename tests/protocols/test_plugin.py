@@ -15,6 +15,7 @@ from sliplab.protocols import plugin
 from sliplab.protocols.plugin import Plugin, plugins
 from tests.conftest import ROOT
 from tests.flows.programs import NO_SERVER
+from tests.packages import write_metadata
 from tests.protocols.planning import said_by
 
 LOADED = """
@@ -78,10 +79,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         monkeypatch.setitem(sys.modules, name, None)  # forgotten again at the end
         del sys.modules[name]
         (tmp_path / f"{name}.py").write_text(declared)
-        info = tmp_path / f"{name}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{plugin.GROUP}]\n{name} = {name}:PLUGIN\n")
+        write_metadata(tmp_path, name, {plugin.GROUP: {name: f"{name}:PLUGIN"}})
         plugins.cache_clear()
 
     monkeypatch.syspath_prepend(str(tmp_path))

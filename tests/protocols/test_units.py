@@ -17,6 +17,7 @@ from sliplab.protocols import InputError, Plan, load_plan, units
 from sliplab.protocols.quantity import parse
 from sliplab.protocols.units import TABLE, file_text, find_unit, symbols_of
 from tests.conftest import ROOT, SMALL
+from tests.packages import write_metadata
 from tests.protocols.planning import plan_of, refused, rows, said_by
 
 PRESSURE = '{"kPa": ("pressure", "1"), "Pa": ("pressure", "0.001"), "bar": ("pressure", "100")}'
@@ -37,12 +38,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def installed(text: str, target: str = "{module}:UNITS", name: str = "lab_units") -> None:
         site = tmp_path / name
-        info = site / f"{name}-1.0.dist-info"
-        info.mkdir(parents=True)
+        write_metadata(site, name, {"sliplab.units": {name: target.format(module=name)}})
         (site / f"{name}.py").write_text(text)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-        entry = f"[sliplab.units]\n{name} = {target.format(module=name)}\n"
-        (info / "entry_points.txt").write_text(entry)
         monkeypatch.syspath_prepend(str(site))
         monkeypatch.delitem(sys.modules, name, raising=False)
 

@@ -12,9 +12,8 @@ import pytest
 from sliplab.plugins.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.discovery import ping_devices
+from tests.plugins.devices.arms import LIMITS
 from tests.rigs.waiting import own_address
-
-LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
 @pytest.fixture

@@ -19,26 +19,18 @@ from sliplab.plugins.abb_socket.driver import AbbSocketArm
 from sliplab.plugins.abb_socket.fake import FakeRapidServer
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.abb_socket.wire import RapidError, RapidSocket, ServerCommand
-from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import Arm, ArmState, RigError, Segment
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
+from tests.plugins.devices.arms import BUSY_S, LIMITS, SLIDE, at, fails
 from tests.plugins.devices.conftest import closed, mm_after_kill, reconnect
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
 
-BUSY_S = 3.0
-LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 MakePair = Callable[..., tuple[AbbSocketArm, FakeRapidServer]]
-
-
-def at(y_mm: float) -> Pose:
-    return Pose((400.0, y_mm, 300.0), HOME.rotvec_deg)
-
-
-SLIDE = [Segment(at(15.0), 1.6)]
 
 
 def settings(host: str, **more: Any) -> AbbSocketSettings:
@@ -60,13 +52,6 @@ def pair() -> Iterator[MakePair]:
             return arm, robot
 
         yield make
-
-
-def fails(action: Callable[[], object], within_s: float, match: str) -> None:
-    began = time.monotonic()
-    with pytest.raises(ArmFault, match=match):
-        action()
-    assert time.monotonic() - began < within_s + BUSY_S
 
 
 @pytest.mark.quick(1)

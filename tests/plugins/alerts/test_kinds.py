@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import Store
 from tests.plugins.alerts.receivers import http_server, mail_server
 from tests.plugins.alerts.test_alerts import RUNNING, Receiver, settings, state
+from tests.rigs.waiting import free_port
 from tests.storage.trial_files import campaign, commit, fail
 
 WITHIN_S = 10.0
@@ -143,12 +143,6 @@ class Case:
 
 def mail(port: int) -> str:
     return f"mailto://127.0.0.1:{port}/?from=lab@example.org&to=anna@example.org"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_table_has_every_kind() -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from typing import Any
@@ -24,6 +22,7 @@ from sliplab.plugins.devices.ur.fake import FakeUr
 from sliplab.plugins.devices.ur.settings import UrSettings
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
+from tests.plugins.devices.arms import LIMITS
 from tests.rigs.waiting import own_address, until
 
 MakeRobot = Callable[..., FakeUr]
@@ -31,8 +30,6 @@ MakeArm = Callable[..., UrArm]
 MakeUr = Callable[..., tuple[UrArm, FakeUr]]
 MakeAbb = Callable[..., tuple[AbbArm, FakeAbb]]
 ABB_PORT, EGM_PORT = 8080, 6510
-LIMIT_S, POLL_S = 60.0, 0.002
-LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
 def ur_settings(host: str, **more: Any) -> UrSettings:
@@ -149,21 +146,3 @@ def abb_pair() -> Iterator[MakeAbb]:
 def pylon_emulation() -> None:
     """pylon lists an emulated camera; before anything in this process has loaded it."""
     emulate(1)
-
-
-@pytest.fixture(name="until")
-def wait_until() -> Callable[[Callable[[], bool]], None]:
-    """Ask until the answer is yes, for at most 60 s, 500 times a second.
-
-    Between questions the interpreter is free: a loop that never lets go of it starves the
-    drivers' threads, which a rig's loop never does.
-    """
-    idle = threading.Event()
-
-    def wait(done: Callable[[], bool]) -> None:
-        end = time.monotonic() + LIMIT_S
-        while not done():
-            assert time.monotonic() < end, f"it has not happened within {LIMIT_S:g} s"
-            idle.wait(POLL_S)
-
-    return wait

@@ -13,11 +13,11 @@ from sliplab.plugins.devices.abb.settings import AbbSettings
 from sliplab.plugins.devices.ur.fake import VERSION
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth
 from sliplab.rigs.core.fakes import Kind
+from tests.plugins.devices.arms import LIMITS
 from tests.plugins.devices.conftest import MakeArm, MakeRobot
 from tests.rigs.waiting import own_address
 
 pytestmark = pytest.mark.realtime
-LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
 def test_a_universal_robot(robot_of: MakeRobot, arm_on: MakeArm) -> None:

@@ -42,10 +42,7 @@ class NewestFirst(ExampleArm):
 
     def read_poses(self) -> PoseChunk:
         """Return the poses since the last call."""
-        poses = super().read_poses()
-        return PoseChunk(
-            poses.t_ns[::-1], poses.host_ns[::-1], poses.xyz_mm[::-1], poses.rotvec_deg[::-1]
-        )
+        return super().read_poses()[::-1]
 
 
 class ClockNotWatched(ExampleArm):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 
 from sliplab.plugins.abb_socket import device as abb_socket
@@ -23,8 +25,9 @@ from sliplab.plugins.uvc import device as uvc
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.registry import listed, load_driver
-from tests.plugins.driver_kit.trying import LIMITS, each_apart, free_udp_port, try_all
-from tests.rigs.waiting import own_address
+from tests.plugins.devices.arms import LIMITS
+from tests.plugins.driver_kit.trying import each_apart, try_all
+from tests.rigs.waiting import free_port, own_address
 
 pytestmark = pytest.mark.realtime
 NO_CLOCK = "this server reports no time"
@@ -41,7 +44,7 @@ def abb_settings() -> AbbSettings:
         host=own_address(),
         rws_port=8080,
         egm_bind="127.0.0.1",
-        egm_port=free_udp_port(),
+        egm_port=free_port(socket.SOCK_DGRAM),
         limits=LIMITS,
         tool={"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
     )

@@ -12,9 +12,10 @@ from sliplab.plugins.driver_kit.conformance import Case, cases
 from sliplab.plugins.driver_kit.examples import arm, events, force, frames, gripper, scalar, sync
 from sliplab.plugins.driver_kit.rule import Bounds
 from sliplab.rigs.core.driver import Driver
+from tests.plugins.devices.arms import LIMITS
 from tests.plugins.driver_kit.broken import BROKEN, Broken
 from tests.plugins.driver_kit.broken_values import WRONG_VALUES
-from tests.plugins.driver_kit.trying import LIMITS, each_apart, try_all
+from tests.plugins.driver_kit.trying import each_apart, try_all
 from tests.rigs.waiting import own_address
 
 pytestmark = pytest.mark.realtime

@@ -20,7 +20,7 @@ from sliplab.plugins.driver_kit.rule import Bounds, NotTried, Rule, RuleBroken, 
 from sliplab.plugins.driver_kit.rule_tables import rule_tables
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.driver import FrameCameraDriver
-from tests.plugins.driver_kit.trying import LIMITS
+from tests.plugins.devices.arms import LIMITS
 from tests.rigs.waiting import own_address
 
 KINDS = (

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
-from typing import Any
 
 from sliplab.plugins.driver_kit.conformance import Case
 from sliplab.plugins.driver_kit.rule import NotTried, RuleBroken
@@ -45,13 +42,3 @@ def try_all(cases: Sequence[Case], at_once: int = AT_ONCE) -> tuple[dict[str, st
 def each_apart(make: Callable[[], list[Case]]) -> list[Case]:
     """Return the cases of a driver, each with an address of its own."""
     return [make()[number] for number in range(len(make()))]
-
-
-def free_udp_port() -> int:
-    """A UDP port that nobody has now."""
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}

@@ -11,14 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
-from sliplab.storage.streams import Json
+from sliplab.storage.formats.recognition import kind_of, skipped_in
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
 from tests.plugins.adapters.adapter_streams import some_frames, write_frames
-from tests.storage.formats.files import SMALL, lab_cells
+from tests.storage.formats.files import SMALL, lab_cells, taken
 
 pytestmark = pytest.mark.usefixtures("small")
 STEM = "d2_s1.0_dir_up_r3"
@@ -54,14 +50,6 @@ def _stream(path: Path) -> None:
         file["events/xs"], file["events/ys"], file["events/ps"] = x, y, p.astype(bool)
 
 
-def _take(tmp_path: Path, path: Path) -> tuple[list[Recording], Json]:
-    store = Store.create(tmp_path / "store")
-    kind = kind_of(path)
-    result = import_trials(store, "theirs", trials_in(path, kind), path, kind)
-    assert verify(store) == []
-    return list(store.campaign("theirs").recordings()), result
-
-
 def _warnings(found: Recording) -> tuple[str, ...]:
     assert found.record.imported is not None
     return found.record.imported.warnings
@@ -77,7 +65,7 @@ def test_pickles_and_stream_of_one_recording_are_one_trial(
     _pickle(events / f"{STEM}_events_on", ON)
     _pickle(events / f"{STEM}_events_off", OFF)
     _stream(events / f"{STEM}_events_stream{ending}")
-    (found,), _ = _take(tmp_path, run / place)
+    _, (found,) = taken(tmp_path / "store", run / place)
     assert found.trial_id == STEM
     assert found.record.condition == {"depth": "2", "speed": "1.0", "direction": "up"}
     assert found.record.repetition == 3
@@ -95,7 +83,7 @@ def test_off_events_in_the_file_of_the_on_events_are_noted(tmp_path: Path) -> No
     cells = lab_cells(SMALL, OFF)
     np.save(events / f"{STEM}_events_on", cells, allow_pickle=True)
     _stream(events / f"{STEM}_events_stream")
-    (found,), _ = _take(tmp_path, tmp_path / "run")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "run")
     assert len(found.events()) == 7
     (text,) = _warnings(found)
     assert text.startswith(f"{STEM}_events_on.npy holds the OFF events of {STEM}_events_stream")
@@ -104,7 +92,7 @@ def test_off_events_in_the_file_of_the_on_events_are_noted(tmp_path: Path) -> No
 def test_polarity_of_an_overwritten_file_alone_is_unknown(tmp_path: Path) -> None:
     events = _run(tmp_path / "run")
     np.save(events / f"{STEM}_events_on", lab_cells(SMALL, OFF), allow_pickle=True)
-    (found,), result = _take(tmp_path, tmp_path / "run")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "run")
     assert "polarity" in found.record.imported.unknown  # type: ignore[union-attr]
     assert "may hold the OFF events" in _warnings(found)[0]
     assert result["warnings"]
@@ -118,7 +106,7 @@ def test_a_column_of_polarities_counts_more_than_the_name(
     _stream(path)
     with h5py.File(path, "r+") as file:
         file["events/ps"][:] = value
-    (found,), _ = _take(tmp_path, path)
+    _, (found,) = taken(tmp_path / "store", path)
     assert set(found.events().p.tolist()) == {int(value)}
     assert any("although its name says ON" in text for text in _warnings(found)) == noted
 
@@ -132,7 +120,7 @@ def test_a_stream_without_a_header_leaves_the_pickles(
     _pickle(tmp_path / f"{STEM}_events_on", ON)
     _pickle(tmp_path / f"{STEM}_events_off", OFF)
     (tmp_path / name).write_bytes(data)
-    (found,), _ = _take(tmp_path, tmp_path)
+    _, (found,) = taken(tmp_path / "store", tmp_path)
     assert len(found.events()) == 7
     assert f"{name} is not imported" in _warnings(found)[0]
 
@@ -142,7 +130,7 @@ def test_a_damaged_stream_leaves_the_pickles(tmp_path: Path) -> None:
     _pickle(events / f"{STEM}_events_on", ON)
     _pickle(events / f"{STEM}_events_off", OFF)
     (events / f"{STEM}_events_stream.h5").write_bytes(b"")
-    (found,), _ = _take(tmp_path, tmp_path / "run")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "run")
     assert len(found.events()) == 7
     assert f"{STEM}_events_stream.h5 is not imported" in _warnings(found)[0]
 
@@ -151,7 +139,7 @@ def test_two_files_of_one_polarity_leave_the_other_recordings(tmp_path: Path) ->
     events = _run(tmp_path / "run")
     for name in ("a_events_on", "a_events_on.pickle", "b_events_on"):
         _pickle(events / name, ON)
-    (found,), result = _take(tmp_path, tmp_path / "run")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "run")
     assert found.trial_id == "b"
     assert "keep one of the two" in result["failed"][0]["reason"]
 
@@ -161,7 +149,7 @@ def test_pickles_without_a_polarity_are_read_with_a_warning(tmp_path: Path) -> N
     folder.mkdir()
     _pickle(folder / "SingleTap_run_0_orientation_0.pickle", ON)
     (folder / "targets_video.csv").write_text("id,pose\n1,0\n")
-    (found,), _ = _take(tmp_path, folder)
+    _, (found,) = taken(tmp_path / "store", folder)
     assert (found.trial_id, len(found.events())) == ("SingleTap_run_0_orientation_0", 3)
     assert "does not say whether its events are ON or OFF" in _warnings(found)[0]
 
@@ -177,7 +165,7 @@ def test_outside_video_has_its_times(tmp_path: Path, times: int, count: int) -> 
     run = tmp_path / "run"
     _pickle(_run(run) / f"{STEM}_events_on", ON)
     _with_video(run, [UNIX + k / 60 for k in range(times)])
-    (found,), _ = _take(tmp_path, run)
+    _, (found,) = taken(tmp_path / "store", run)
     expected = [round((UNIX + k / 60) * 1e6) * 1000 for k in range(count)]
     assert found.frame_times().tolist() == expected
     assert len(list(found.frames())) == count
@@ -192,7 +180,7 @@ def test_unreadable_video_times_and_meta_leave_the_events(tmp_path: Path) -> Non
     (run / "videos" / f"tactip_out_{STEM}.mkv").write_bytes(b"\0\0\0\x20ftypisom")
     (run / "videos" / f"event_stream_{STEM}.mp4").write_bytes(b"")
     (run / "meta.json").write_text("{")
-    (found,), _ = _take(tmp_path, run)
+    _, (found,) = taken(tmp_path / "store", run)
     assert (len(found.events()), found.record.counts.frames) == (3, 0)
     texts = " ".join(_warnings(found))
     assert "meta.json is not read" in texts
@@ -200,7 +188,7 @@ def test_unreadable_video_times_and_meta_leave_the_events(tmp_path: Path) -> Non
     assert found.record.imported.left_out == [f"event_stream_{STEM}.mp4"]  # type: ignore[union-attr]
     (run / "timestamps_tactip_out.pkl").write_bytes(b"cos\nsystem\n(V/nowhere\ntR.")
     (tmp_path / "again").mkdir()
-    (again,), _ = _take(tmp_path / "again", run)
+    _, (again,) = taken(tmp_path / "again" / "store", run)
     assert "timestamps_tactip_out.pkl is not read" in " ".join(_warnings(again))
 
 
@@ -221,7 +209,7 @@ def test_force_file_becomes_a_stream(tmp_path: Path, form: str) -> None:
     else:
         columns = dict(zip(("t", "fx", "fy", "fz"), rows.T.tolist(), strict=True))
         path.write_bytes(pickle.dumps(columns))
-    (found,), _ = _take(tmp_path, run)
+    _, (found,) = taken(tmp_path / "store", run)
     forces = found.wrenches("force")
     assert forces.t_ns.tolist() == [0, 1_000_000]
     assert forces.force_n.tolist() == [[1, 2, 3], [4, 5, 6]]

@@ -15,11 +15,9 @@ from sliplab.plugins.formats import prophesee
 from sliplab.plugins.formats.evt import LAST_TURN_US, ROOM
 from sliplab.plugins.formats.prophesee import read_header, read_prophesee, salvage_prophesee
 from sliplab.storage.formats.foreign import Damage, ForeignTrial, FormatError, left_out_of
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store
 from tests.protocols.planning import rows
+from tests.storage.formats.files import taken
 
 Row = tuple[int, int, int, int]
 ON = 1 << 11
@@ -304,9 +302,7 @@ def test_an_event_that_steps_back_a_little_is_raised_and_counted(
     assert [row[0] for row in listed(found)] == [*map(int, times.split())], name
     (line,) = found.notes()
     assert line.startswith(f"{says} us: ")
-    store = Store.create(tmp_path / "store")
-    result = import_trials(store, "theirs", trials_in(path, "raw"), path, "raw")
-    (recording,) = store.campaign("theirs").recordings()
+    result, (recording,) = taken(tmp_path / "store", path, "raw")
     assert recording.record.imported is not None
     assert recording.record.imported.warnings[0] == line
     assert result["warnings"][0] == f"{path.name}: {line}"
@@ -363,9 +359,7 @@ def test_a_wrong_word_of_1000_costs_its_events_alone(tmp_path: Path, form: str, 
         x[7], right = 640, np.delete(right, 7)
         dropped = {"events outside of the sensor": 1}
     path = write(tmp_path, form, _timed(form, times, x))
-    store = Store.create(tmp_path / "s")
-    import_trials(store, "theirs", trials_in(path, "raw"), path, "raw")
-    (found,) = store.campaign("theirs").recordings()
+    _, (found,) = taken(tmp_path / "store", path, "raw")
     np.testing.assert_array_equal(found.events().t_us, right)
     assert found.record.imported is not None
     assert found.record.imported.dropped == dropped
@@ -581,9 +575,7 @@ def test_edges_of_the_first_input_are_triggers(tmp_path: Path, form: str) -> Non
     assert trial.triggers.kind.tolist() == [1, 2]
     assert "triggers" not in trial.unknown
     assert trial.about["left_out"] == ["trigger input 6"]
-    store = Store.create(tmp_path / "store")
-    import_trials(store, "theirs", trials_in(path, "raw"), path, "raw")
-    (recording,) = store.campaign("theirs").recordings()
+    _, (recording,) = taken(tmp_path / "store", path, "raw")
     with recording.open() as reader:
         assert reader.pulses("event_pulses").tolist() == [66_000]
 

@@ -19,14 +19,13 @@ from sliplab.plugins.formats.ros.messages import Fields
 from sliplab.plugins.formats.ros.pictures import PictureDecoder
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.foreign import FormatError
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
-from sliplab.storage.streams import EventChunk, Json
+from sliplab.storage.formats.recognition import kind_of, skipped_in
+from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
 from tests.plugins.formats import ros_files as ros
 from tests.plugins.formats.ros_files import BASE_NS, ROS1, ROS2, SIZE
+from tests.storage.formats.files import taken
 
 ENCODINGS = ("mono", "libcaer", "libcaer_cmp", "evt3")
 Write = Callable[[Path, list[ros.Message]], None]
@@ -64,20 +63,10 @@ WRITERS: dict[str, tuple[str, Any, Write]] = {
 }
 
 
-def take(folder: Path, path: Path, *, salvage: bool = False) -> tuple[Json, list[Recording]]:
-    """Import into a new store; return the result and what is there."""
-    store = Store.create(folder)
-    kind = kind_of(path)
-    found = trials_in(path, kind, salvage=salvage)
-    result = import_trials(store, "theirs", found, path, kind, salvage=salvage)
-    assert verify(store) == []
-    return result, list(store.campaign("theirs").recordings())
-
-
 def refused(folder: Path, path: Path) -> str:
     """Import into a new store, which is refused and leaves nothing; return the message."""
     with pytest.raises(InputError) as caught:
-        take(folder, path)
+        taken(folder, path)
     assert Store.open(folder).campaigns() == []
     return caught.value.message
 
@@ -99,7 +88,7 @@ def test_every_container_gives_events_and_frames(tmp_path: Path, writer: str, of
     sent = ros.sent()
     made = ros.arrays(store, sent) if of == "list" else ros.packets(store, of, sent)
     write(tmp_path / name, [*made, *ros.frames(store)])
-    result, (found,) = take(tmp_path / "store", tmp_path / name)
+    result, (found,) = taken(tmp_path / "store", tmp_path / name)
     assert (result["events"], result["frames"]) == (len(sent), 3)
     assert "warnings" not in result
     assert found.trial_id == "a"
@@ -115,7 +104,7 @@ def test_every_encoding_gives_the_events(tmp_path: Path, encoding: str, writer: 
     name, store, write = WRITERS[writer]
     sent = ros.sent()
     write(tmp_path / name, ros.packets(store, encoding, sent))
-    _, (found,) = take(tmp_path / "store", tmp_path / name)
+    _, (found,) = taken(tmp_path / "store", tmp_path / name)
     assert_events(found, sent)
     assert found.record.imported is not None
     assert found.record.imported.encoding == encoding
@@ -127,7 +116,7 @@ def test_a_database_alone_is_read_as_its_folder_is(tmp_path: Path) -> None:
     ros.write_folder(tmp_path / "rec", ros.packets(ROS2, "libcaer_cmp", sent))
     lone = tmp_path / "odd ?#% name.db3"
     shutil.move(tmp_path / "rec" / "rec.db3", lone)
-    _, (found,) = take(tmp_path / "store", lone)
+    _, (found,) = taken(tmp_path / "store", lone)
     assert found.trial_id == "odd_name"
     assert_events(found, sent)
     assert {item.name for item in tmp_path.iterdir()} == {"rec", lone.name, "store"}
@@ -140,7 +129,7 @@ def test_a_definition_of_an_unknown_encoding_costs_nothing(tmp_path: Path) -> No
     ros.write_folder(tmp_path / "rec", ros.packets(ROS2, "mono", ros.sent()))
     with sqlite3.connect(tmp_path / "rec" / "rec.db3") as database:
         database.execute("UPDATE message_definitions SET encoding = 'unknown'")
-    result, _ = take(tmp_path / "store", tmp_path / "rec")
+    result, _ = taken(tmp_path / "store", tmp_path / "rec")
     assert result["events"] == 2000
 
 
@@ -159,14 +148,14 @@ def test_the_parts_of_a_folder_are_one_trial(tmp_path: Path) -> None:
     line = next(one for one in text.splitlines() if "rec_0.mcap" in one and "path" not in one)
     named = "\n".join(line.replace("rec_0", f"rec_{number}") for number in range(5))
     (rec / "metadata.yaml").write_text(text.replace(line, named))
-    result, (found,) = take(tmp_path / "store", tmp_path / "all")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "all")
     assert_events(found, sent)
     (line,) = result["warnings"]
     assert line == "rec: lacks rec_4.mcap, a part of the recording that metadata.yaml names"
     assert skipped_in(tmp_path / "all", "rosbag") == []
     (rec / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
     assert skipped_in(rec, "rosbag") == []
-    result, (found,) = take(tmp_path / "again", rec)
+    result, (found,) = taken(tmp_path / "again", rec)
     assert_events(found, sent)
     assert "has a damaged metadata.yaml" in result["warnings"][0]
 
@@ -197,7 +186,7 @@ def test_what_is_not_read_is_named(tmp_path: Path, writer: str) -> None:
         ("/other", ros.IMAGE, other),
     ]
     write(tmp_path / name, made)
-    result, (found,) = take(tmp_path / "store", tmp_path / name)
+    result, (found,) = taken(tmp_path / "store", tmp_path / name)
     assert (result["events"], result["frames"]) == (2000, 3)
     about = found.record.imported
     assert about is not None
@@ -215,7 +204,7 @@ def test_what_is_not_read_is_named(tmp_path: Path, writer: str) -> None:
 def test_events_of_an_unknown_encoding_do_not_cost_the_frames(tmp_path: Path) -> None:
     made = [*ros.packets(ROS2, "trigger", ros.sent()), *ros.frames(ROS2)]
     ros.write_mcap(tmp_path / "a.mcap", made)
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert (result["events"], result["frames"]) == (0, 3)
     assert found.record.imported is not None
     (line,) = found.record.imported.warnings
@@ -238,7 +227,7 @@ def test_the_second_camera_is_read_where_the_first_cannot_be(tmp_path: Path) -> 
     first = ros.packets(ROS2, "trigger", ros.sent(500))
     second = [("/right", kind, one) for _, kind, one in ros.arrays(ROS2, ros.sent(500))]
     ros.write_mcap(tmp_path / "a.mcap", [*first, *second])
-    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert_events(found, ros.sent(500))
 
 
@@ -257,7 +246,7 @@ def test_a_broken_message_costs_itself(tmp_path: Path, writer: str, encoding: st
     frames = ros.frames(store)
     frames[1] = ("/camera/image_raw", ros.IMAGE, b"\0\1\0\0abc")
     write(tmp_path / name, [*made, *frames])
-    result, (found,) = take(tmp_path / "store", tmp_path / name)
+    result, (found,) = taken(tmp_path / "store", tmp_path / name)
     assert result["frames"] == 2
     if encoding == "evt3":  # row and time of the events behind it are not known at first
         rows = list(zip(*(c.tolist() for c in vars(found.events()).values()), strict=True))
@@ -279,7 +268,7 @@ def test_events_outside_of_the_camera_are_left_out_and_counted(tmp_path: Path) -
         sent.x[[7, 8, 900]] = SIZE[0]
         path = tmp_path / f"{encoding}.mcap"
         ros.write_mcap(path, ros.packets(ROS2, encoding, sent))
-        result, (found,) = take(tmp_path / encoding, path)
+        result, (found,) = taken(tmp_path / encoding, path)
         inside = sent.x < SIZE[0]
         assert_events(found, sent[inside])
         assert result["warnings"] == [f"{path.name}: 3 events outside of the sensor left out"]
@@ -297,7 +286,7 @@ def test_a_packet_that_runs_back_is_left_out(tmp_path: Path, writer: str, at: in
     late = EventChunk(sent.x[:9], sent.y[:9], sent.p[:9], sent.t_us[:9] + 10**9)
     made.insert(at, ros.packets(store, "mono", late)[0] if at == 0 else made[2])
     write(tmp_path / name, made)
-    result, (found,) = take(tmp_path / "store", tmp_path / name)
+    result, (found,) = taken(tmp_path / "store", tmp_path / name)
     assert_events(found, sent)
     (line,) = result["warnings"]
     assert f"{9 if at == 0 else 250} events " in line
@@ -312,7 +301,7 @@ def test_a_damaged_chunk_of_a_bag_costs_itself(tmp_path: Path, writer: str) -> N
     at = data.index(b"compression=", len(data) // 2) + 60
     data[at : at + 200] = b"\xff" * 200
     (tmp_path / name).write_bytes(data)
-    result, _ = take(tmp_path / "store", tmp_path / name)
+    result, _ = taken(tmp_path / "store", tmp_path / name)
     assert 18_000 <= result["events"] < 20_000
     (line,) = result["warnings"]
     assert "of 80 messages of /event_camera/events are left out; the first one is in a" in line
@@ -325,7 +314,7 @@ def test_a_damaged_page_of_a_database_costs_its_messages(tmp_path: Path) -> None
     leaves = [at for at in range(0, len(data), 4096) if data[at] == 13]
     data[leaves[80] + 8 : leaves[80] + 16] = b"\xff" * 8  # where its rows stand
     path.write_bytes(data)
-    result, _ = take(tmp_path / "store", path)
+    result, _ = taken(tmp_path / "store", path)
     assert 38_000 < result["events"] < 40_000
     (line,) = result["warnings"]
     assert "of 160 messages of /event_camera/events are left out; the first one is in a" in line
@@ -339,7 +328,7 @@ def test_a_database_that_is_cut_short_is_salvaged(tmp_path: Path) -> None:
     said = refused(tmp_path / "plain", path)
     assert "rec.db3: is cut short: it has " in said
     assert "; --salvage imports " in said
-    result, (found,) = take(tmp_path / "saved", path, salvage=True)
+    result, (found,) = taken(tmp_path / "saved", path, salvage=True)
     assert 10_000 < result["events"] < 30_000
     assert_events(found, sent[: result["events"]])
     assert result["salvaged"][0]["reason"].startswith("is cut short: it has ")
@@ -367,7 +356,7 @@ def test_flipped_bits_give_events_or_one_line(tmp_path: Path, writer: str) -> No
         data[rng.integers(0, len(data), 1 + 10 * (number % 3))] ^= np.uint8(1 << number % 8)
         path.write_bytes(data.tobytes())
         try:
-            result, _ = take(tmp_path / str(number), path)
+            result, _ = taken(tmp_path / str(number), path)
         except InputError as error:
             assert "\n" not in error.message  # noqa: PT017
             assert error.message.startswith(f"{path}: ")  # noqa: PT017
@@ -378,7 +367,7 @@ def test_flipped_bits_give_events_or_one_line(tmp_path: Path, writer: str) -> No
 def test_messages_that_sqlite_left_beside_a_database_are_named(tmp_path: Path) -> None:
     ros.write_folder(tmp_path / "rec", ros.packets(ROS2, "mono", ros.sent()))
     (tmp_path / "rec" / "rec.db3-wal").write_bytes(b"more")
-    result, _ = take(tmp_path / "store", tmp_path / "rec")
+    result, _ = taken(tmp_path / "store", tmp_path / "rec")
     assert "rec.db3-wal, in which its recorder left messages" in result["warnings"][0]
 
 
@@ -473,7 +462,7 @@ def test_edges_of_evt3_are_triggers(tmp_path: Path) -> None:
     data = words(0x8001, 0x6009, 5, 0x2807, 0xA001, 0x600B, 0xA000, 0xA601, 0x2008)
     made = [("/e", ros.PACKET, ros.packet(ROS2, BASE_NS, "evt3", data))]
     ros.write_mcap(tmp_path / "a.mcap", made)
-    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     with found.open() as reader:
         assert reader.pulses("event_pulses").tolist() == [BASE_NS]
     assert found.record.imported is not None
@@ -486,7 +475,7 @@ def test_words_of_evt3_that_are_called_libcaer_cmp_are_read_with_a_warning(tmp_p
     for _, _, one in made:
         one.encoding = "libcaer_cmp"
     ros.write_mcap(tmp_path / "a.mcap", made)
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert_events(found, sent)
     assert "are called libcaer_cmp and hold words of evt3" in result["warnings"][0]
 
@@ -498,7 +487,7 @@ def test_packets_of_evt3_of_a_run_before_are_left_out(tmp_path: Path) -> None:
     before = EventChunk(sent.x[:9], sent.y[:9], sent.p[:9], sent.t_us[:9] + (400 << 12))
     made = [*ros.packets(ROS2, "evt3", before), *ros.packets(ROS2, "evt3", sent)]
     ros.write_mcap(tmp_path / "a.mcap", made)
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     events = found.events()
     for name in ("x", "y", "p"):
         np.testing.assert_array_equal(getattr(events, name), getattr(sent, name))
@@ -522,7 +511,7 @@ def test_a_packet_that_comes_twice_is_taken_once(tmp_path: Path, encoding: str) 
     sent = ros.sent()
     made = _numbered(encoding, sent)
     ros.write_mcap(tmp_path / "a.mcap", [*made[:4], made[3], made[3], *made[4:]])
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert_events(found, sent)
     assert result["warnings"]
 
@@ -531,7 +520,7 @@ def test_packets_of_evt3_behind_a_lost_one_have_no_times_of_it(tmp_path: Path) -
     sent = ros.sent()
     made = _numbered("evt3", sent)
     ros.write_mcap(tmp_path / "a.mcap", [*made[:3], *made[5:]])
-    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     rows = _rows(found.events())
     assert 1250 < len(rows) < 1500
     assert set(rows) <= set(_rows(sent))
@@ -541,7 +530,7 @@ def test_a_late_packet_of_evt3_is_left_out(tmp_path: Path) -> None:
     sent = ros.sent()
     made = _numbered("evt3", sent)
     ros.write_mcap(tmp_path / "a.mcap", [*made[:3], made[4], made[3], *made[5:]])
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     rows = _rows(found.events())
     assert 1500 < len(rows) < 1750
     assert set(rows) <= set(_rows(sent))
@@ -554,7 +543,7 @@ def test_a_driver_of_evt3_that_starts_again_counts_its_packets_from_0(tmp_path: 
     for number, (_, _, one) in enumerate(made[4:]):
         one.seq = number
     ros.write_mcap(tmp_path / "a.mcap", made)
-    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert 1750 < len(found.events()) <= 2000
 
 
@@ -651,7 +640,7 @@ def test_compressed_frames_are_read(tmp_path: Path, ending: str) -> None:
         for n in range(3)
     ]
     ros.write_mcap(tmp_path / "a.mcap", [*ros.packets(ROS2, "evt3", ros.sent()), *made])
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert (result["events"], result["frames"]) == (2000, 3)
     for levels in found.frames():
         assert np.abs(levels.astype(int) - IN_GREY).max() <= (0 if ending == "png" else 90)
@@ -661,7 +650,7 @@ def test_raw_frames_come_before_compressed_ones(tmp_path: Path) -> None:
     data = cv2.imencode(".png", BGR)[1].tobytes()
     small = ("/a/compressed", ros.COMPRESSED, ros.compressed(ROS2, BASE_NS, "png", data))
     ros.write_mcap(tmp_path / "a.mcap", [small, *ros.frames(ROS2)])
-    _, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert found.record.imported is not None
     assert found.record.imported.frame_topic == "/camera/image_raw"
     assert found.record.imported.left_out == ["/a/compressed"]
@@ -682,7 +671,7 @@ def test_a_frame_that_cannot_be_right_is_left_out(tmp_path: Path, name: str) -> 
     bad = topic, kind, BAD_FRAMES[name]
     late = ros.image(ROS2, BASE_NS + 9, "mono8", np.full((4, 6), 30, np.uint8))
     ros.write_mcap(tmp_path / "a.mcap", [*good, bad, (topic, kind, late)])
-    result, (found,) = take(tmp_path / "store", tmp_path / "a.mcap")
+    result, (found,) = taken(tmp_path / "store", tmp_path / "a.mcap")
     assert result["frames"] == 4
     assert [int(levels[0, 0]) for levels in found.frames()] == [0, 10, 20, 30]
     says = "1 of 5 messages of /camera/image_raw are left out"

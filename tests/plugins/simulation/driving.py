@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,11 +30,8 @@ class Trial:
 
 
 def joined(chunks: list[Any]) -> dict[str, np.ndarray]:
-    return {
-        field.name: np.concatenate([getattr(chunk, field.name) for chunk in chunks])
-        for field in fields(chunks[0])
-        if getattr(chunks[0], field.name) is not None
-    }
+    whole = type(chunks[0]).concatenate(chunks)
+    return {name: values for name, values in vars(whole).items() if values is not None}
 
 
 def go(

@@ -86,7 +86,7 @@ def test_it_is_the_same_in_any_pieces(wait_s: float) -> None:
         for _ in range(round(2.0 / step_s)):
             devices.clock.wait(step_s)
             parts.append(devices.force.read())
-        found.append(joined(parts))
+        found.append(WrenchChunk.concatenate(parts))
     n = min(map(len, found))
     assert n > 1900
     for whole, pieces in zip(*map(columns, found), strict=True):
@@ -140,11 +140,7 @@ def at_rest(force: dict[str, Any], seconds: float, seed: int = 3) -> tuple[Any, 
     for _ in range(round(seconds)):
         devices.clock.wait(1.0)
         parts.append(devices.force.read())
-    return devices, joined(parts)
-
-
-def joined(parts: list[WrenchChunk]) -> WrenchChunk:
-    return WrenchChunk(*map(np.concatenate, zip(*map(columns, parts), strict=True)))
+    return devices, WrenchChunk.concatenate(parts)
 
 
 def columns(chunk: WrenchChunk) -> tuple[np.ndarray, ...]:

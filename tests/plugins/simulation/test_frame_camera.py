@@ -44,13 +44,7 @@ def grab(devices: MockDevices, seconds: float, chunk_s: float, size: int = SIZE)
     devices.frames.stop()
     devices.clock.wait(0.1)
     chunks.append(devices.frames.read())
-
-    def joined(name: str) -> Any:
-        parts = [getattr(chunk, name) for chunk in chunks]
-        return None if parts[0] is None else np.concatenate(parts)
-
-    names = ("images", "number", "t_ns", "host_ns", "sync", "markers_px", "plate_px")
-    return FrameChunk(*(joined(name) for name in names))
+    return FrameChunk.concatenate(chunks)
 
 
 def slide(chunk_s: float = 0.1, size: int = SIZE, **camera: Any) -> tuple[MockDevices, FrameChunk]:

@@ -85,8 +85,7 @@ def read_often(devices: MockDevices, device: Any, n: int = 400) -> ClockReads:
         devices.clock.wait(0.02)
         reads.append(device.read_clock())
         assert [len(reads[-1]), reads[-1].device_ns.dtype] == [1, np.int64]
-    names = ("device_ns", "before_ns", "after_ns")
-    return ClockReads(*(np.concatenate([getattr(r, name) for r in reads]) for name in names))
+    return ClockReads.concatenate(reads)
 
 
 @pytest.mark.parametrize("name", ["sync_box", "frame_camera"])

@@ -90,17 +90,18 @@ def answering(
     return shown
 
 
+def everywhere(title: str, work: Any, jobs: Sequence[Any], done: Any = None) -> list[Any]:
+    """Do the work of several processes in this one."""
+    found = [work(job) for job in jobs]
+    for number, one in enumerate(found):
+        if done is not None:
+            done(number, one)
+    return found
+
+
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds are made in this process."""
-
-    def everywhere(title: str, work: Any, jobs: Sequence[Any], done: Any = None) -> list[Any]:
-        found = [work(job) for job in jobs]
-        for number, one in enumerate(found):
-            if done is not None:
-                done(number, one)
-        return found
-
     monkeypatch.setattr(worlds, "everywhere", everywhere)
     monkeypatch.setattr(calibrate, "everywhere", everywhere)
     monkeypatch.setattr(calibrate, "PREDICTED", 2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,8 +33,8 @@ from sliplab.plugins.twin.pilot import Forces, PilotTrial, SlideMotion
 from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
+from tests.conftest import ROOT
 
-ROOT = Path(__file__).parents[3]
 RING = np.repeat([0, 1, 2], [1, 6, 12])
 ANGLE = np.concatenate([np.arange(n) * 2 * np.pi / n for n in (1, 6, 12)])
 LATTICE = 5.6 * RING[:, None] * np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,11 +43,9 @@ from sliplab.rigs.core.faults import PapillaTorn
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import F64, EventChunk
+from tests.conftest import ROOT
+from tests.plugins.twin.test_contact_estimates import LATTICE, RING
 
-ROOT = Path(__file__).parents[3]
-RING = np.repeat([0, 1, 2], [1, 6, 12])
-ANGLE = np.concatenate([np.arange(n) * 2 * np.pi / n for n in (1, 6, 12)])
-LATTICE = 5.6 * RING[:, None] * np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])
 WAYS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 LENGTH_MM = 9.0
 SPEEDS = (1.0, 1.6)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,8 @@ from sliplab.plugins.uvc.fake import VideoPipe
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import FrameCamera, RigError
 from sliplab.rigs.core.registry import find_driver
-from tests.plugins.devices.conftest import wait_until
+from tests.rigs.waiting import until
 
-__all__ = ["wait_until"]  # a fixture
-
-Until = Callable[[Callable[[], bool]], None]
 SMALL: dict[str, Any] = {"width_px": 64, "height_px": 48}
 
 
@@ -138,7 +135,7 @@ def pipe() -> Iterator[VideoPipe]:
 
 
 @pytest.mark.realtime
-def test_pictures_come_unchanged_cut_to_the_region_and_in_order(pipe: Any, until: Until) -> None:
+def test_pictures_come_unchanged_cut_to_the_region_and_in_order(pipe: Any) -> None:
     images = np.random.default_rng(7).integers(0, 256, (20, 48, 64)).astype(np.uint8)
     camera = UvcCamera(UvcSettings(device=pipe.path, back_pressure_s=0.2, **SMALL), 10.0)
     try:
@@ -191,7 +188,7 @@ class Changing:
         return self.retrieve()
 
 
-def test_pictures_of_another_size_are_a_fault(until: Until, monkeypatch: Any) -> None:
+def test_pictures_of_another_size_are_a_fault(monkeypatch: Any) -> None:
     right, wrong = np.zeros((48, 64, 3), np.uint8), np.zeros((24, 64, 3), np.uint8)
     device = Changing([right, right, right, wrong])
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
@@ -204,7 +201,7 @@ def test_pictures_of_another_size_are_a_fault(until: Until, monkeypatch: Any) ->
 
 
 @pytest.mark.realtime
-def test_an_ended_stream_and_a_killed_process_are_faults(pipe: VideoPipe, until: Until) -> None:
+def test_an_ended_stream_and_a_killed_process_are_faults(pipe: VideoPipe) -> None:
     camera = UvcCamera(UvcSettings(device=pipe.path, **SMALL), 10.0)
     try:
         camera.start()

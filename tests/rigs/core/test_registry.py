@@ -15,6 +15,7 @@ from sliplab.rigs.core import registry
 from sliplab.rigs.core.driver import ArmDriver, EventCameraDriver
 from sliplab.rigs.core.registry import DriverError, find_driver, listed
 from sliplab.rigs.device_section import DeviceSettings
+from tests.packages import write_metadata
 
 CAMERA = '''
 from typing import Literal
@@ -45,10 +46,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     def put(module: str, code: str, point: str) -> None:
         (tmp_path / f"{module}.py").write_text(code)
-        about = tmp_path / f"{module}-1.2.dist-info"
-        about.mkdir()
-        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.2\n")
-        (about / "entry_points.txt").write_text(f"[sliplab.drivers]\n{point}\n")
+        name, place = point.split(" = ")
+        write_metadata(tmp_path, module, {"sliplab.drivers": {name: place}}, "1.2")
         _forget()
 
     _forget()

@@ -26,14 +26,13 @@ from sliplab.storage.formats.export_trials import export_trials, label_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST, FormatError, Triggers
 from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
+from sliplab.storage.formats.recognition import name_of, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue, write_table
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
-from tests.storage.formats.files import SMALL, lab_hdf5, lab_pickles
+from tests.storage.formats.files import SMALL, lab_hdf5, lab_pickles, take
 from tests.storage.trial_files import campaign, commit
 
 
@@ -47,10 +46,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store.open(folder)
 
 
-def _import(folder: Path, path: Path, kind: str = "", name: str = "theirs") -> Store:
+def _import(folder: Path, path: Path, kind: str = "") -> Store:
     made = Store.create(folder)
-    kind = kind or kind_of(path)
-    import_trials(made, name, trials_in(path, kind), path, kind)
+    take(made, path, kind)
     return made
 
 
@@ -70,7 +68,6 @@ def test_a_campaign_goes_out_and_comes_back(store: Store, tmp_path: Path, kind: 
     result = export_trials(list(ours.recordings()), tmp_path / "out", kind, "c")
     assert (result["trials"], result["events"], result["triggers"]) == (2, 2000, 20)
     made = _import(tmp_path / "store", tmp_path / "out")
-    assert verify(made) == []
     theirs = made.campaign("theirs")
     assert theirs.committed() == ours.committed()
     for one, other in zip(ours.recordings(), theirs.recordings(), strict=True):
@@ -164,7 +161,6 @@ def test_we_read_what_dv_processing_writes(tmp_path: Path) -> None:
     path = tmp_path / "theirs.aedat4"
     _by_library(_OF_DV, path)
     made = _import(tmp_path / "store", path)
-    assert verify(made) == []
     found = made.campaign("theirs").recording("theirs")
     number = np.arange(5000)
     events = _events(found)
@@ -231,9 +227,7 @@ def _packets(path: Path, whole: EventChunk, lengths: list[int]) -> None:
     with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (640, 480), "camera")}) as file:
         ends = np.cumsum(lengths).tolist()
         for low, high in zip([0, *ends[:-1]], ends, strict=True):
-            columns = (whole.x, whole.y, whole.p, whole.t_us)
-            part = EventChunk(*(column[low:high] for column in columns))  # type: ignore[arg-type]
-            file._write(0, events_buffer(part))
+            file._write(0, events_buffer(whole[low:high]))
 
 
 @pytest.mark.parametrize(
@@ -247,9 +241,7 @@ def test_packets_of_any_length(tmp_path: Path, lengths: list[int]) -> None:
     with Aedat4File(tmp_path / "b.aedat4") as file:
         found = list(file.events(0))
     assert all(len(chunk) for chunk in found)
-    for name in ("x", "y", "p", "t_us"):
-        joined = np.concatenate([getattr(chunk, name) for chunk in found])
-        np.testing.assert_array_equal(joined, getattr(events, name))
+    _same(EventChunk.concatenate(found), events)
 
 
 @pytest.mark.quick(7)
@@ -269,11 +261,9 @@ def test_one_wrong_event_is_left_out(tmp_path: Path, at: int, column: str, value
     found = made.campaign("theirs").recording("b")
     in_order = (value, at) in {(1 << 52, 69_999), (3, 0)}
     if not in_order:
-        columns = (events.x, events.y, events.p, events.t_us)
-        events = EventChunk(*(np.delete(column, at) for column in columns))
+        events = events[np.arange(len(events)) != at]
     _same(_events(found), events)
     assert found.record.imported.dropped == ({} if in_order else {reason: 1})
-    assert verify(made) == []
 
 
 @pytest.mark.parametrize("size", [3, 300_000, 5 << 20])
@@ -310,7 +300,6 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
     found = made.campaign("theirs").recording("a")
     assert [f"a.aedat4: {one}" for one in found.record.imported.warnings] == [text]
     _same(_events(found), whole)
-    assert verify(made) == []
     export_trials([found], tmp_path / "out", "aedat4", "theirs")
     with Aedat4File(tmp_path / "out" / "a.aedat4") as again:
         back = [chunk.t_us for chunk in again.events(0)]
@@ -342,7 +331,6 @@ def test_the_labs_pickles(tmp_path: Path, by_columns: bool) -> None:
     lab_pickles(tmp_path, stem, SMALL[::-1], by_columns=by_columns)
     (tmp_path / "notes.txt").write_text("is left out")
     made = _import(tmp_path / "store", tmp_path)
-    assert verify(made) == []
     found = made.campaign("theirs").recording(stem)
     events = _events(found)
     columns = (events.t_us, events.x, events.y, events.p)
@@ -358,7 +346,6 @@ def test_the_labs_hdf5(tmp_path: Path) -> None:
     reported = lab_hdf5(tmp_path / "slide 1.h5")
     made = _import(tmp_path / "store", tmp_path / "slide 1.h5")
     _same(_events(made.campaign("theirs").recording("slide_1")), reported)
-    assert verify(made) == []
 
 
 def test_columns_of_different_lengths_are_refused(tmp_path: Path) -> None:

@@ -26,9 +26,8 @@ from sliplab.storage.formats import import_trials as import_module
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.flatbuffers import events_buffer
 from sliplab.storage.formats.foreign import Triggers
-from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, name_of, trials_in
-from sliplab.storage.streams import EventChunk, Json
+from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, sha256
 from sliplab.storage.trials.recording import Recording
@@ -37,7 +36,7 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.plugins.adapters.adapters import SLIDES, bring, slides
 from tests.plugins.formats.test_lerobot import foreign
-from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
+from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5, take, taken
 
 BACK = "events whose times run back"
 NO_TIME = "events without a valid time"
@@ -48,18 +47,8 @@ TIMES = NUMBER * 10
 ODD = NUMBER % 2
 
 
-def _take(store: Store, path: Path, *, salvage: bool = False) -> Json:
-    kind = kind_of(path)
-    found = trials_in(path, kind, salvage=salvage)
-    result = import_trials(store, "theirs", found, path, kind, salvage=salvage)
-    assert verify(store) == []
-    return result
-
-
 def _one(folder: Path, path: Path, *, salvage: bool = False) -> Recording:
-    store = Store.create(folder)
-    _take(store, path, salvage=salvage)
-    (found,) = store.campaign("theirs").recordings()
+    _, (found,) = taken(folder, path, salvage=salvage)
     return found
 
 
@@ -190,16 +179,16 @@ def test_events_that_can_be_right_are_kept_and_others_counted(tmp_path: Path, ca
 
 def test_a_trial_committed_before_a_signal_stays(tmp_path: Path, monkeypatch: Any) -> None:
     _dsec(tmp_path / "a.h5", TIMES)
-    take = import_module._take
+    whole = import_module._take
 
-    def taken(*args: Any) -> Any:
-        take(*args)
+    def interrupted(*args: Any) -> Any:
+        whole(*args)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(import_module, "_take", taken)
+    monkeypatch.setattr(import_module, "_take", interrupted)
     store = Store.create(tmp_path / "store")
     with pytest.raises(KeyboardInterrupt):
-        _take(store, tmp_path / "a.h5")
+        take(store, tmp_path / "a.h5")
     assert store.campaign("theirs").committed() == {"a"}
 
 
@@ -258,7 +247,7 @@ def test_one_event_before_the_clock_costs_neither_file_nor_folder(tmp_path: Path
         cells = lab_cells(SMALL, {(3, 5): times})
         (folder / f"d3_s0.5_dir_up_r{number}_events_on").write_bytes(pickle.dumps(cells))
     store = Store.create(tmp_path / "store")
-    result = _take(store, folder)
+    result = take(store, folder)
     assert [len(one.events()) for one in store.campaign("theirs").recordings()] == [2, 2, 2]
     (item,) = result["left_out"]
     assert (item["trial"], item["left_out"]) == ("d3_s0.5_dir_up_r1", {NO_TIME: 1})
@@ -350,7 +339,7 @@ def test_one_bad_episode_leaves_the_others(tmp_path: Path, number: int) -> None:
     foreign(tmp_path / "set")
     _faulty_lerobot(tmp_path / "set", number)
     store = Store.create(tmp_path / "store")
-    result = _take(store, tmp_path / "set")
+    result = take(store, tmp_path / "set")
     assert result["imported"] == [f"episode-{1 - number:06d}"]
     (failed,) = result["failed"]
     assert failed["trial"] == f"episode-{number:06d}"
@@ -565,7 +554,7 @@ def test_names_in_any_script_stay_apart_and_are_in_the_record(tmp_path: Path) ->
     for stem in stems:
         _dsec(folder / f"{stem}.h5", np.arange(COUNT))
     store = Store.create(tmp_path / "store")
-    result = _take(store, folder)
+    result = take(store, folder)
     names = result["imported"]
     assert len({name.casefold() for name in names}) == len(stems)
     assert all(name.isascii() for name in names)
@@ -575,7 +564,7 @@ def test_names_in_any_script_stay_apart_and_are_in_the_record(tmp_path: Path) ->
     assert files["测试.h5"].startswith("Ce_Shi-")
     assert files["Проба 1.h5"].startswith("Proba_1-")
     assert files["trial.h5"] == "trial"
-    assert _take(store, folder)["imported"] == []
+    assert take(store, folder)["imported"] == []
 
 
 @pytest.mark.parametrize("name", ["a" * 251, "ü" * 125, "con", "trial.", "...", "\udcff"])

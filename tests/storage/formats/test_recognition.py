@@ -17,24 +17,13 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
+from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
 from tests.command_line import here
-from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
+from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5, taken
 
 SIZE = SMALL[::-1]
-
-
-def _import(folder: Path, path: Path, kind: str = "") -> list[Recording]:
-    made = Store.create(folder)
-    kind = kind or kind_of(path)
-    import_trials(made, "theirs", trials_in(path, kind), path, kind)
-    assert verify(made) == []
-    return list(made.campaign("theirs").recordings())
 
 
 def _pickled(path: Path, cells: Any) -> None:
@@ -68,7 +57,7 @@ def test_the_labs_names_with_and_without_ending(
     write(folder / name.format("off"), lab_cells(SIZE, {(7, 0): [11]}).T)
     (folder / "light_on").write_text("a note")
     (folder / "starting_timestamps.pickle").write_bytes(pickle.dumps([1, 2]))
-    (found,) = _import(tmp_path / "store", folder)
+    _, (found,) = taken(tmp_path / "store", folder)
     assert found.trial_id == stem
     events = found.events()
     assert events.t_us.tolist() == [10_000, 11_000, 12_000]
@@ -88,7 +77,7 @@ def test_cameras_of_the_lab_and_lists_of_one_length(tmp_path: Path) -> None:
     on[7, 100] = 3.5
     _saved(folder / "a_events_on.npy", on)
     _pickled(folder / "a_events_off", lab_cells((180, 240), {(2, 1): [1.0]}))
-    (found,) = _import(tmp_path / "store", folder)
+    _, (found,) = taken(tmp_path / "store", folder)
     events = found.events()
     assert len(events) == 240 * 180 + 1
     late = np.flatnonzero(events.t_us == 3500)
@@ -124,13 +113,13 @@ def _events(x: list[int]) -> EventChunk:
 def test_content_comes_before_the_ending(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"d2_s1.0_stream{ending}"
     _aedat4(path, _events([3, 4]))
-    (found,) = _import(tmp_path / "a", path)
+    _, (found,) = taken(tmp_path / "a", path)
     assert found.events().x.tolist() == [3, 4]
     if not ending:
         assert found.trial_id == "d2_s1.0_stream"
     lab_hdf5(path)
     assert kind_of(path) == "lab-hdf5"
-    (found,) = _import(tmp_path / "b", path)
+    _, (found,) = taken(tmp_path / "b", path)
     assert len(found.events()) == 50
 
 
@@ -167,7 +156,7 @@ def test_the_resolution_of_the_labs_streams(
     tmp_path: Path, resolution: Any, x: list[int], y: list[int], size: list[int] | None
 ) -> None:
     _stream(tmp_path / "a.h5", resolution, x, y)
-    (found,) = _import(tmp_path / "store", tmp_path / "a.h5")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a.h5")
     assert found.record.geometry.event_px == (None if size is None else tuple(size))
     assert ("sensor size" in found.record.imported.unknown) == (size is None)
     events = found.events()
@@ -231,7 +220,7 @@ def test_a_bad_file_is_named_with_what_would_be_right(
     else:
         data(tmp_path / file)
     with pytest.raises(InputError, match=says) as caught:
-        _import(tmp_path / "store", tmp_path / file)
+        taken(tmp_path / "store", tmp_path / file)
     assert caught.value.message.count(file) == 1
     assert Store.open(tmp_path / "store").campaigns() == []
 
@@ -241,7 +230,7 @@ def test_a_bad_file_of_faerys(tmp_path: Path) -> None:
     _es(tmp_path / "a.es")
     says = r"after 0 events faery stops with: y overflow .*outside of the 320 x 16"
     with pytest.raises(InputError, match=says) as caught:
-        _import(tmp_path / "store", tmp_path / "a.es")
+        taken(tmp_path / "store", tmp_path / "a.es")
     assert caught.value.message.count("a.es") == 1
 
 
@@ -254,7 +243,7 @@ EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400
 )
 def test_a_size_that_no_header_gives_is_unknown(tmp_path: Path, header: str, size: Any) -> None:
     _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
-    (found,) = _import(tmp_path / "store", tmp_path / "a")
+    _, (found,) = taken(tmp_path / "store", tmp_path / "a")
     assert found.record.geometry.event_px == (None if size is None else tuple(size))
     assert ("sensor size" in found.record.imported.unknown) == (size is None)
     events = found.events()
@@ -278,7 +267,7 @@ def _mixed(folder: Path) -> None:
 def test_a_folder_of_several_formats_is_sorted(tmp_path: Path) -> None:
     folder = tmp_path / "theirs"
     _mixed(folder)
-    found = _import(tmp_path / "store", folder)
+    _, found = taken(tmp_path / "store", folder)
     origins = {one.trial_id: one.record.imported.format for one in found}
     assert origins == {"a": "lab-hdf5", "b": "aedat4", "c": "lab-pickles", "d": "dsec"}
     assert [len(one.events()) for one in found] == [50, 2, 2, 2]
@@ -304,7 +293,7 @@ def test_two_formats_of_one_name_are_left_out_and_the_rest_is_imported(tmp_path:
     assert "holds 2 files for the trial b: b.aedat4, b.h5; " in " ".join(done.stderr.split())
     campaign = Store.open(tmp_path / "store").campaign("theirs")
     assert [one.trial_id for one in campaign.recordings()] == ["a"]
-    assert [one.trial_id for one in _import(tmp_path / "s", folder, "aedat4")] == ["a", "b"]
+    assert [one.trial_id for one in taken(tmp_path / "s", folder, "aedat4")[1]] == ["a", "b"]
 
 
 def test_two_files_of_one_name_and_nothing_else_are_refused(tmp_path: Path) -> None:
@@ -313,7 +302,7 @@ def test_two_files_of_one_name_and_nothing_else_are_refused(tmp_path: Path) -> N
     _aedat4(folder / "b.aedat4", _events([3]))
     lab_hdf5(folder / "b.h5")
     with pytest.raises(InputError, match=r"2 files for the trial b: b\.aedat4, b\.h5; .*KIND"):
-        _import(tmp_path / "store", folder)
+        taken(tmp_path / "store", folder)
     assert Store.open(tmp_path / "store").campaigns() == []
 
 
@@ -327,10 +316,10 @@ def test_a_missing_library_is_said_before_anything_is_written(
     _raw(folder / "b.raw", words=EVT2)
     _es(folder / "c.es")
     with pytest.raises(InputError, match=r"c\.es: .*pip install 'sliplab\[formats\]'"):
-        _import(tmp_path / "store", folder)
+        taken(tmp_path / "store", folder)
     assert Store.open(tmp_path / "store").campaigns() == []
     (folder / "c.es").unlink()
-    assert [one.trial_id for one in _import(tmp_path / "other", folder)] == ["a", "b"]
+    assert [one.trial_id for one in taken(tmp_path / "other", folder)[1]] == ["a", "b"]
 
 
 def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path) -> None:
@@ -343,7 +332,7 @@ def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path)
     manifest = {"sliplab_export": 1, "simulated": True, "trials": [item]}
     (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
     assert kind_of(folder) == MIXED
-    (found,) = _import(tmp_path / "store", folder)
+    _, (found,) = taken(tmp_path / "store", folder)
     assert (found.trial_id, found.simulated, len(found.events())) == ("t", True, 2)
     assert [(one.file, one.reason) for one in skipped_in(folder, MIXED)] == [
         ("b.h5", f"is not in {EXPORT_MANIFEST}")
@@ -352,4 +341,4 @@ def test_an_export_among_other_files_is_imported_by_its_manifest(tmp_path: Path)
     (folder / "notes.txt").write_text("a note")
     (folder / EXPORT_MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(InputError, match=r"notes\.txt: is of no known format"):
-        _import(tmp_path / "again", folder)
+        taken(tmp_path / "again", folder)

@@ -17,12 +17,12 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.recognition import kind_of, trials_in
+from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.verify import verify
+from tests.storage.formats.files import taken
 from tests.storage.formats.recordings import (
     CHECKED,
     COUNT,
@@ -51,16 +51,11 @@ class Outcome:
 
 def _import(folder: Path, path: Path, *, salvage: bool) -> Outcome:
     """Import into a new store; where that is refused, nothing is left of it."""
-    store = Store.create(folder)
     try:
-        kind = kind_of(path)
-        found = trials_in(path, kind, salvage=salvage)
-        import_trials(store, "theirs", found, path, kind, salvage=salvage)
+        _, (recording,) = taken(folder, path, salvage=salvage)
     except InputError as error:
         _check_refused(folder, path, error.message)
         return Outcome(error)
-    assert verify(store) == []
-    (recording,) = store.campaign("theirs").recordings()
     return Outcome(None, recording)
 
 

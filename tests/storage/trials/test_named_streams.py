@@ -36,10 +36,6 @@ def wrenches(count: int, seed: int = 0) -> WrenchChunk:
 ALL = wrenches(COUNT)
 
 
-def cut(chunk: WrenchChunk, rows: slice) -> WrenchChunk:
-    return WrenchChunk(*(getattr(chunk, field)[rows] for field in FIELDS))
-
-
 def said(**rows: int) -> dict[str, dict[str, object]]:
     """What a record says of streams."""
     return {name: {"kind": "wrench", "rows": count} for name, count in rows.items()}
@@ -50,8 +46,8 @@ def write(writer: TrialWriter, pieces: int) -> Path:
     fill(writer)
     edges = np.linspace(0, COUNT, pieces + 1).astype(int).tolist()
     for low, high in pairwise(edges):
-        writer.add("force", cut(ALL, slice(low, high)))
-    writer.add("arm_force", cut(ALL, slice(0, 300)))
+        writer.add("force", ALL[low:high])
+    writer.add("arm_force", ALL[:300])
     known = record("t", streams=said(force=COUNT, arm_force=300))
     return writer.commit(known, Provenance())
 
@@ -61,7 +57,7 @@ def test_they_come_back_however_they_were_chunked(pieces: int, tmp_path: Path) -
     folder = write(campaign(tmp_path / "s").begin("t", FRAME, 100), pieces)
     recording = Recording(folder)
     for name, rows in (("force", slice(None)), ("arm_force", slice(0, 300))):
-        found, sent = recording.wrenches(name), cut(ALL, rows)
+        found, sent = recording.wrenches(name), ALL[rows]
         assert len(found) == len(sent)
         for field in FIELDS:
             assert np.array_equal(getattr(found, field), getattr(sent, field))
@@ -141,7 +137,7 @@ def test_verify_holds_file_and_record_against_each_other(
 ) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     fill(writer)
-    writer.add("force", cut(ALL, slice(0, rows)))
+    writer.add("force", ALL[:rows])
     writer.commit(record("t", **({"streams": streams} if streams else {})), Provenance())
     assert any(problem in found.what for found in verify(Store.open(tmp_path / "s")))
 
@@ -149,8 +145,8 @@ def test_verify_holds_file_and_record_against_each_other(
 def test_verify_sees_a_clock_that_runs_backwards(tmp_path: Path) -> None:
     writer = campaign(tmp_path / "s").begin("t", FRAME, 100)
     fill(writer)
-    writer.add("force", cut(ALL, slice(0, 2)))
-    writer.add("force", cut(ALL, slice(0, 1)))
+    writer.add("force", ALL[:2])
+    writer.add("force", ALL[:1])
     writer.commit(record("t", streams=said(force=3)), Provenance())
     found = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
     assert found == ["streams/force/t runs backwards"]

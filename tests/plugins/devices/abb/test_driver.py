@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,31 +13,16 @@ from sliplab.plugins.devices import abb
 from sliplab.plugins.devices.abb import settings
 from sliplab.plugins.devices.abb.driver import AbbArm
 from sliplab.plugins.devices.abb.rws import REQUEST_S, START_REQUESTS
-from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import Arm, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import WorkspaceError
 from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.pose import distance_mm
+from tests.plugins.devices.arms import BUSY_S, SLIDE, at, fails
 from tests.plugins.devices.conftest import EGM_PORT, MakeAbb, abb_settings, reconnect
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
-
-BUSY_S = 3.0
-
-
-def at(y_mm: float) -> Pose:
-    return Pose((400.0, y_mm, 300.0), HOME.rotvec_deg)
-
-
-SLIDE = [Segment(at(15.0), 1.6)]
-
-
-def fails(action: Callable[[], object], within_s: float, match: str) -> None:
-    began = time.monotonic()
-    with pytest.raises(ArmFault, match=match):
-        action()
-    assert time.monotonic() - began < within_s + BUSY_S
 
 
 def within(span: tuple[int, int], t_ns: np.ndarray) -> Any:

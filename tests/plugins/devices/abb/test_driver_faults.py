@@ -7,7 +7,6 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,11 +14,11 @@ from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.plugins.devices.abb import driver, settings
 from sliplab.plugins.devices.abb.driver import AbbArm
-from sliplab.plugins.devices.abb.fake import FakeAbb
 from sliplab.plugins.devices.abb.rws import REQUEST_S, WebRefused, WebServices
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
 from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Kind
 from sliplab.rigs.core.pose import distance_mm
+from tests.plugins.devices.arms import BUSY_S, SLIDE, at, fails, sliding
 from tests.plugins.devices.conftest import (
     EGM_PORT,
     MakeAbb,
@@ -32,30 +31,8 @@ from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
 
-BUSY_S = 3.0
 FAR = Pose((9999.0, 9999.0, 9999.0), HOME.rotvec_deg)
 LOST_S = settings.FAILURES * (settings.MONITOR_S + 2 * REQUEST_S) + BUSY_S
-
-
-def at(y_mm: float) -> Pose:
-    return Pose((400.0, y_mm, 300.0), HOME.rotvec_deg)
-
-
-SLIDE = [Segment(at(15.0), 1.6)]
-
-
-def sliding(arm: AbbArm, robot: FakeAbb) -> tuple[Any, Any]:
-    """Start a slide, and wait until the arm moves."""
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
-    return arm, robot
-
-
-def fails(action: Callable[[], object], within_s: float, match: str) -> None:
-    began = time.monotonic()
-    with pytest.raises(ArmFault, match=match):
-        action()
-    assert time.monotonic() - began < within_s + BUSY_S
 
 
 def packet(pose: Pose, number: int, t_s: float) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ from sliplab.plugins.devices.basler.driver import BaslerCamera, find_camera
 from sliplab.plugins.devices.basler.settings import BaslerSettings
 from sliplab.rigs.core.capabilities import FrameCamera, RigError
 from sliplab.storage.streams import FrameChunk
+from tests.rigs.waiting import gather, until
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
-Until = Callable[[Callable[[], bool]], None]
 FREE: dict[str, Any] = {"trigger": "free run", "px_per_mm": 20.0}
 PATIENT: dict[str, Any] = {"back_pressure_s": 1.0, "first_frame_s": 30.0, "stall_s": 20.0}
 """Few buffers, for each costs time before the first frame, and limits for a busy computer."""
@@ -42,29 +42,14 @@ def opened(lossy: bool = False, **settings: Any) -> Iterator[BaslerCamera]:
         camera.close()
 
 
-def numbers_of(chunks: list[FrameChunk]) -> list[int]:
-    return np.concatenate([chunk.number for chunk in chunks]).tolist()
-
-
-def collect(camera: BaslerCamera, count: int, until: Until) -> list[FrameChunk]:
-    chunks: list[FrameChunk] = []
-
-    def enough() -> bool:
-        chunks.append(camera.read())
-        return sum(map(len, chunks)) >= count
-
-    until(enough)
-    return chunks
-
-
-def test_it_can_do_what_a_frame_camera_must(until: Until) -> None:
+def test_it_can_do_what_a_frame_camera_must() -> None:
     with opened(**FREE, exposure_us=3000) as camera:
         assert isinstance(camera, FrameCamera)
         assert camera.mid_exposure_ns == 1_500_000
         assert camera.px_per_mm == 20.0
         assert camera.read().images.shape == (0, 48, 64)
         camera.start()
-        (first, *_) = [chunk for chunk in collect(camera, 3, until) if len(chunk)]
+        first = gather(camera.read, 3)
         assert first.images.dtype == np.uint8
         assert first.images.shape[1:] == (48, 64)
         assert first.number[0] == 0
@@ -82,117 +67,105 @@ def test_the_region_is_in_the_middle_and_must_fit() -> None:
             camera.set_region(64, 48)
 
 
-def test_pictures_are_those_of_the_scene_in_order(tmp_path: Path, until: Until) -> None:
+def test_pictures_are_those_of_the_scene_in_order(tmp_path: Path) -> None:
     images = scene_frames(8, 64, 48)
     write_frames(tmp_path / "frames", images)
     with opened(**FREE) as camera:
         show(camera.device, tmp_path / "frames")
         camera.start()
-        chunks = collect(camera, 16, until)
-    for chunk in chunks:
-        for image, number in zip(chunk.images, chunk.number.tolist(), strict=True):
-            assert np.array_equal(image, images[number % 8])
+        chunk = gather(camera.read, 16)
+    assert np.array_equal(chunk.images, images[chunk.number % 8])
 
 
-def test_every_software_trigger_gives_one_frame(until: Until) -> None:
+def test_every_software_trigger_gives_one_frame() -> None:
     with opened(trigger="software", px_per_mm=20.0) as camera:
         camera.start()
         for number in range(5):
             camera.trigger()
-            assert numbers_of(collect(camera, 1, until)) == [number]
+            assert gather(camera.read, 1).number.tolist() == [number]
         camera.stop()
         assert len(camera.read()) == 0
         assert (camera.counts.grabbed, camera.counts.lost) == (5, 0)
 
 
-def test_under_load_none_is_missing_and_order_holds(until: Until) -> None:
+def test_under_load_none_is_missing_and_order_holds() -> None:
     with opened(**FREE, rate_hz=500, exposure_us=100) as camera:
         camera.set_region(1000, 1000)
         camera.start()
-        chunks = collect(camera, 150, until)
+        chunk = gather(camera.read, 150)
         camera.stop()
-        chunks.append(camera.read())
-        numbers = numbers_of(chunks)
+        chunk = FrameChunk.concatenate([chunk, camera.read()])
+        numbers = chunk.number.tolist()
         assert numbers == list(range(len(numbers)))
         assert camera.counts.grabbed == len(numbers)
         assert camera.counts.lost == 0
-        assert all(np.all(np.diff(chunk.host_ns) >= 0) for chunk in chunks)
+        assert np.all(np.diff(chunk.host_ns) >= 0)
 
 
-def test_the_counter_begins_anew_with_every_start(until: Until) -> None:
-    with opened(**FREE) as camera:
-        for _ in range(2):
-            camera.start()
-            assert numbers_of(collect(camera, 3, until))[:3] == [0, 1, 2]
-            camera.stop()
-
-
-def test_a_reader_that_sleeps_loses_nothing_while_there_are_buffers(until: Until) -> None:
+def test_a_reader_that_sleeps_loses_nothing_while_there_are_buffers() -> None:
     with opened(**FREE, rate_hz=100, back_pressure_s=1.0) as camera:
         camera.start()
         until(lambda: camera.counts.grabbed >= 50)  # the queue is full
         until(lambda: camera.device.NumReadyBuffers.Value >= 5)  # and now pylon waits
-        numbers = numbers_of(collect(camera, 60, until))
+        numbers = gather(camera.read, 60).number.tolist()
         assert numbers == list(range(len(numbers)))
         assert camera.counts.lost == 0
 
 
-def test_times_come_from_exposure_ends_where_a_wire_ties_them_down(until: Until) -> None:
+def test_times_come_from_exposure_ends_where_a_wire_ties_them_down() -> None:
     with opened(**WIRED, exposure_us=2000) as camera:
         assert (camera.stamping.means, camera.stamping.grade) == (
             "exposure end event",
             "exposure line",
         )
         camera.start()
-        chunks = collect(camera, 20, until)
+        chunk = gather(camera.read, 20)
         camera.stop()
-        t_ns = np.concatenate([chunk.t_ns for chunk in chunks])
-        host_ns = np.concatenate([chunk.host_ns for chunk in chunks])
-        assert np.all(np.diff(t_ns) > 0)
+        assert np.all(np.diff(chunk.t_ns) > 0)
         # pylon's emulation stamps with the host's clock: the middle lies half an exposure back
-        assert np.all(t_ns + camera.mid_exposure_ns <= host_ns)
+        assert np.all(chunk.t_ns + camera.mid_exposure_ns <= chunk.host_ns)
         assert camera.counts.unstamped == 0
         assert camera.describe()["time_stamps"] == "exposure end event"
 
 
-def test_a_clock_that_nothing_ties_down_is_not_used(until: Until) -> None:
+def test_a_clock_that_nothing_ties_down_is_not_used() -> None:
     with opened(**FREE) as camera:
         assert camera.stamping.grade == camera.describe()["grade"] == "host arrival"
         with pytest.raises(RigError, match="no clock"):
             camera.read_clock()
         camera.start()
-        for chunk in collect(camera, 3, until):
-            assert np.array_equal(chunk.t_ns, chunk.host_ns)
+        chunk = gather(camera.read, 3)
+        assert np.array_equal(chunk.t_ns, chunk.host_ns)
 
 
-def test_failed_buffers_are_counted_and_leave_a_gap(until: Until) -> None:
+def test_failed_buffers_are_counted_and_leave_a_gap() -> None:
     with opened(**FREE) as camera:
         camera.start()
-        chunks = collect(camera, 5, until)
+        numbers = gather(camera.read, 5).number.tolist()
         fail_buffers(camera.device, 3)
         until(lambda: camera.counts.failed == 3)
-        numbers = numbers_of([*chunks, *collect(camera, 5, until)])
+        numbers += gather(camera.read, 5).number.tolist()
         gone = sorted(set(range(numbers[-1] + 1)) - set(numbers))
         assert len(gone) == 3
         assert gone == list(range(gone[0], gone[0] + 3))
         assert (camera.counts.skipped, camera.counts.lost) == (0, 3)
 
 
-def test_skipped_frames_are_counted_and_leave_a_gap(until: Until) -> None:
+def test_skipped_frames_are_counted_and_leave_a_gap() -> None:
     with opened(lossy=True, **WIRED) as camera:
         camera.start()
-        chunks = collect(camera, 5, until)
+        numbers = gather(camera.read, 5).number.tolist()
         camera.device.drop_frames(4)
         until(lambda: camera.counts.skipped == 4)
-        numbers = numbers_of([*chunks, *collect(camera, 5, until)])
+        numbers += gather(camera.read, 5).number.tolist()
         assert len(set(range(numbers[-1] + 1)) - set(numbers)) == 4
         assert (camera.counts.failed, camera.counts.lost) == (0, 4)
 
 
-def test_an_unplugged_camera_is_an_error_after_what_it_gave(until: Until) -> None:
+def test_an_unplugged_camera_is_an_error_after_what_it_gave() -> None:
     with opened(**FREE) as camera:
         camera.start()
-        collect(camera, 3, until)
+        gather(camera.read, 3)
         unplug(camera.device)
         with pytest.raises(RigError, match="unplugged"):
             until(lambda: camera.read() is None)
@@ -201,17 +174,17 @@ def test_an_unplugged_camera_is_an_error_after_what_it_gave(until: Until) -> Non
             camera.start()
 
 
-def test_a_silent_camera_is_an_error_within_the_stated_time(until: Until) -> None:
+def test_a_silent_camera_is_an_error_within_the_stated_time() -> None:
     with opened(lossy=True, **FREE, stall_s=1.0) as camera:
         camera.start()
-        collect(camera, 3, until)
+        gather(camera.read, 3)
         camera.device.fall_silent()
         with pytest.raises(RigError, match=r"no frame for \d\.\d s"):
             until(lambda: camera.read() is None)
         camera.stop()
 
 
-def test_before_the_first_frame_silence_has_a_limit_of_its_own(until: Until) -> None:
+def test_before_the_first_frame_silence_has_a_limit_of_its_own() -> None:
     with opened(lossy=True, **FREE, first_frame_s=0.3) as camera:
         camera.device.fall_silent()
         camera.start()
@@ -231,13 +204,6 @@ def test_a_line_trigger_can_be_set_and_then_nothing_comes_by_itself() -> None:
         assert len(camera.read()) == 0
         camera.stop()
         assert camera.counts.grabbed == 0
-
-
-def test_close_may_come_at_any_time_and_twice() -> None:
-    camera = BaslerCamera(BaslerSettings(**FREE))
-    camera.start()
-    camera.close()
-    camera.close()
 
 
 def test_a_closed_camera_gives_its_descriptors_back_though_an_error_keeps_it() -> None:

@@ -14,7 +14,7 @@ from sliplab.plugins.devices.basler.fake_live import LiveBasler
 from sliplab.plugins.devices.basler.settings import BaslerSettings
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.streams import FrameChunk
-from tests.rigs.waiting import until
+from tests.rigs.waiting import gather, until
 
 pytestmark = pytest.mark.realtime
 
@@ -50,24 +50,6 @@ def frames(first: int, count: int) -> FrameChunk:
     return FrameChunk(images, number, t_ns, t_ns, (number % 3 == 0).astype(np.uint8))
 
 
-def read(camera: BaslerCamera, count: int) -> FrameChunk:
-    """That many frames, in one piece."""
-    parts: list[FrameChunk] = []
-
-    def came() -> bool:
-        part = camera.read()
-        if len(part.number):
-            parts.append(part)
-        return sum(len(part.number) for part in parts) >= count
-
-    until(came, ARRIVE_S)
-    joined = (np.concatenate([getattr(p, name) for p in parts]) for name in FIELDS)
-    return FrameChunk(*joined)
-
-
-FIELDS = ("images", "number", "t_ns", "host_ns", "sync")
-
-
 @pytest.fixture
 def scene() -> FakeScene:
     return FakeScene()
@@ -89,7 +71,7 @@ def test_pictures_numbers_times_and_levels_are_the_scenes(scene: FakeScene, came
     assert scene.grabbed == [(WIDTH, HEIGHT)]
     sent = frames(0, 12)
     scene.on_frames(sent)
-    got = read(camera, 12)
+    got = gather(camera.read, 12)
     assert np.array_equal(got.images, sent.images)
     assert got.number.tolist() == sent.number.tolist()
     assert got.t_ns.tolist() == sent.t_ns.tolist()
@@ -102,10 +84,10 @@ def test_pictures_numbers_times_and_levels_are_the_scenes(scene: FakeScene, came
 def test_what_was_exposed_before_the_stop_can_be_read_after_it(scene: Any, camera: Any) -> None:
     camera.start()
     scene.on_frames(frames(0, 3))
-    read(camera, 3)
+    gather(camera.read, 3)
     scene.last = frames(3, 9)
     camera.stop()
-    assert read(camera, 9).number.tolist() == list(range(3, 12))
+    assert gather(camera.read, 9).number.tolist() == list(range(3, 12))
     assert camera.counts.lost == 0
 
 
@@ -113,24 +95,24 @@ def test_every_run_counts_from_0(scene: FakeScene, camera: BaslerCamera) -> None
     for _ in range(2):
         camera.start()
         scene.on_frames(frames(0, 4))
-        assert read(camera, 4).number.tolist() == [0, 1, 2, 3]
+        assert gather(camera.read, 4).number.tolist() == [0, 1, 2, 3]
         camera.stop()
 
 
 def test_dropped_frames_are_a_gap_in_the_numbers(scene: FakeScene, camera: BaslerCamera) -> None:
     camera.start()
     scene.on_frames(frames(0, 2))
-    read(camera, 2)
+    gather(camera.read, 2)
     camera.device.drop_frames(3)
     scene.on_frames(frames(2, 6))
-    assert read(camera, 3).number.tolist() == [5, 6, 7]
+    assert gather(camera.read, 3).number.tolist() == [5, 6, 7]
     assert camera.counts.lost == camera.counts.skipped == 3
 
 
 def test_a_clock_that_falls_back_is_a_fault(scene: FakeScene, camera: BaslerCamera) -> None:
     camera.start()
     scene.on_frames(frames(0, 3))
-    read(camera, 3)
+    gather(camera.read, 3)
     later = frames(3, 3)
     scene.on_frames(replace(later, t_ns=later.t_ns - 2_000_000_000))
     with pytest.raises(RigError, match=r"its clock jumped back by 1\.990 s"):
@@ -140,7 +122,7 @@ def test_a_clock_that_falls_back_is_a_fault(scene: FakeScene, camera: BaslerCame
 def test_an_unplugged_camera_is_noticed_with_what_to_do(scene: FakeScene, camera: Any) -> None:
     camera.start()
     scene.on_frames(frames(0, 2))
-    read(camera, 2)
+    gather(camera.read, 2)
     camera.device.unplug()
 
     with pytest.raises(RigError, match="unplugged; plug it in and open it again"):

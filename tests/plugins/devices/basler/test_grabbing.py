@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +16,9 @@ import pytest
 from sliplab.plugins.devices.basler.frame_time import FrameStamping
 from sliplab.plugins.devices.basler.grabbing import NO_ID, Grab, GrabSettings
 from sliplab.rigs.core.capabilities import RigError
+from tests.rigs.waiting import until
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
-Until = Callable[[Callable[[], bool]], None]
 LIMITS: dict[str, Any] = {"period_ns": 10_000_000, "late_ns": 100_000_000, "queue": 100}
 LIMITS |= {"mid_exposure_ns": 1000, "first_id": 0, "sync_bit": 2, "first_ns": 0, "stall_ns": 0}
 CHUNKS = GrabSettings(stamping=FrameStamping("chunk", "hardware trigger"), **LIMITS)
@@ -76,7 +76,7 @@ def changed(**changes: Any) -> GrabSettings:
     return GrabSettings(**vars(CHUNKS) | changes)
 
 
-def test_chunks_give_time_and_level_of_the_sync_line(until: Until) -> None:
+def test_chunks_give_time_and_level_of_the_sync_line() -> None:
     level, other, stamp = (SimpleNamespace(Value=value) for value in (0b0100, 0b1011, 5_000_000))
     first = Result(0, ChunkTimestamp=stamp, ChunkLineStatusAll=level)
     with grabbing(Device(first, Result(1, ChunkLineStatusAll=other))) as grab:
@@ -86,7 +86,7 @@ def test_chunks_give_time_and_level_of_the_sync_line(until: Until) -> None:
         assert (second.number, second.sync) == (1, 0)
 
 
-def test_a_frame_out_of_order_or_twice_is_counted_and_kept_back(until: Until) -> None:
+def test_a_frame_out_of_order_or_twice_is_counted_and_kept_back() -> None:
     with grabbing(Device(*map(Result, (0, 2, 1, 2, 3)))) as grab:
         until(lambda: grab.counts.grabbed == 3)
         assert [frame.number for frame in grab.take()] == [0, 2, 3]
@@ -94,7 +94,7 @@ def test_a_frame_out_of_order_or_twice_is_counted_and_kept_back(until: Until) ->
         assert (counts.skipped, counts.out_of_order) == (1, 2)
 
 
-def test_without_block_ids_what_pylon_overwrote_is_counted(until: Until) -> None:
+def test_without_block_ids_what_pylon_overwrote_is_counted() -> None:
     first = Result(0, BlockID=NO_ID, ImageNumber=1)
     second = Result(0, BlockID=NO_ID, ImageNumber=2, NumberOfSkippedImages=3)
     with grabbing(Device(first, second)) as grab:
@@ -102,7 +102,7 @@ def test_without_block_ids_what_pylon_overwrote_is_counted(until: Until) -> None
         assert grab.counts.skipped == 3
 
 
-def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Until) -> None:
+def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on() -> None:
     first = Result(0)
     device = Device(first)
     with grabbing(device) as grab:
@@ -137,7 +137,7 @@ class Gige(Device):
         return Result(frame % self.ids + 1, TimeStamp=10_000_000 * frame + 1)
 
 
-def test_block_ids_of_gige_wrap_at_16_bits(until: Until) -> None:
+def test_block_ids_of_gige_wrap_at_16_bits() -> None:
     frames = [*range(65_000, 66_000), *range(97_000, 97_100), *range(129_000, 131_500)]
     with grabbing(Gige(frames), GIGE) as grab:
         until(lambda: grab.counts.grabbed == len(frames))
@@ -145,7 +145,7 @@ def test_block_ids_of_gige_wrap_at_16_bits(until: Until) -> None:
         assert [frame.number for frame in grab.take()] == frames
 
 
-def test_extended_block_ids_do_not_wrap(until: Until) -> None:
+def test_extended_block_ids_do_not_wrap() -> None:
     with grabbing(Gige(range(65_000, 66_000), 2**40), GIGE) as grab:
         until(lambda: grab.counts.grabbed == 1000)
         assert (grab.counts.skipped, grab.counts.out_of_order) == (65_000, 0)
@@ -153,7 +153,7 @@ def test_extended_block_ids_do_not_wrap(until: Until) -> None:
 
 
 @pytest.mark.parametrize(("last", "first"), [(65_530, 65_540), (65_534, 65_536), (60_000, 80_000)])
-def test_frames_lost_across_the_wrap_are_counted(until: Until, last: int, first: int) -> None:
+def test_frames_lost_across_the_wrap_are_counted(last: int, first: int) -> None:
     numbers = [*range(59_000, last + 1), *range(first, first + 10)]
     with grabbing(Gige(numbers), GIGE) as grab:
         until(lambda: grab.counts.grabbed == len(numbers))
@@ -161,7 +161,7 @@ def test_frames_lost_across_the_wrap_are_counted(until: Until, last: int, first:
         assert [frame.number for frame in grab.take()] == numbers
 
 
-def test_incomplete_and_repeated_frames_across_the_wrap_are_counted(until: Until) -> None:
+def test_incomplete_and_repeated_frames_across_the_wrap_are_counted() -> None:
     device = Gige(())
     device.results = [
         Result(block, TimeStamp=10_000_000 * at, good=block != 65_535)
@@ -176,7 +176,7 @@ def test_incomplete_and_repeated_frames_across_the_wrap_are_counted(until: Until
 
 
 @pytest.mark.parametrize("before", [300, 30_000, 50_000, 65_000])
-def test_camera_that_begins_again_is_noticed(until: Until, before: int) -> None:
+def test_camera_that_begins_again_is_noticed(before: int) -> None:
     device = Gige(())
     ids = [*range(before - 99, before + 1), *range(1, 200)]
     device.results = [Result(block, TimeStamp=10_000_000 * at) for at, block in enumerate(ids, 1)]
@@ -186,13 +186,13 @@ def test_camera_that_begins_again_is_noticed(until: Until, before: int) -> None:
         assert re.search(r"no frame for 0.3 s \(\d+ lost or unusable", str(grab.fault))
 
 
-def test_block_id_far_ahead_is_dropped(until: Until) -> None:
+def test_block_id_far_ahead_is_dropped() -> None:
     with grabbing(Device(*map(Result, (0, 1, 2**40, 2, 3)))) as grab:
         until(lambda: grab.counts.grabbed == 4)
         assert (grab.counts.skipped, grab.counts.out_of_order) == (0, 1)
 
 
-def test_exposure_ends_are_found_by_block_ids_that_wrap(until: Until) -> None:
+def test_exposure_ends_are_found_by_block_ids_that_wrap() -> None:
     settings = changed(**vars(GIGE) | {"stamping": EXPOSED})
     ends = {block: 10_000_000 * at for at, block in enumerate((65_534, 65_535, 1, 2), 1)}
     device = Gige(())
@@ -203,7 +203,7 @@ def test_exposure_ends_are_found_by_block_ids_that_wrap(until: Until) -> None:
 
 
 @pytest.mark.parametrize("useless", [{"good": False}, {"BlockID": 1}, {"BlockID": 2**50}])
-def test_frames_that_cannot_be_used_are_silence(until: Until, useless: dict[str, Any]) -> None:
+def test_frames_that_cannot_be_used_are_silence(useless: dict[str, Any]) -> None:
     """However many of them come."""
 
     class Useless(Device):
@@ -223,14 +223,14 @@ def test_frames_that_cannot_be_used_are_silence(until: Until, useless: dict[str,
         device.on = False
 
 
-def test_a_promised_stamp_that_is_missing_ends_the_run(until: Until) -> None:
+def test_a_promised_stamp_that_is_missing_ends_the_run() -> None:
     device = Device(Result(0, ChunkTimestamp=SimpleNamespace(Value=0)))
     with grabbing(device) as grab:
         until(lambda: grab.fault is not None)
         assert "has no time stamp" in str(grab.fault)
 
 
-def test_a_late_exposure_end_is_waited_for_and_one_that_never_comes_given_up(until: Until) -> None:
+def test_a_late_exposure_end_is_waited_for_and_one_that_never_comes_given_up() -> None:
     ends: dict[int, int] = {1: 9_000}
     settings = changed(stamping=EXPOSED, sync_bit=None, late_ns=10**12)
     device = Device(Result(0), Result(1))
@@ -245,7 +245,7 @@ def test_a_late_exposure_end_is_waited_for_and_one_that_never_comes_given_up(unt
         assert [frame.number for frame in grab.take()] == [2]
 
 
-def test_a_frame_that_still_waits_for_its_time_at_the_end_is_counted(until: Until) -> None:
+def test_a_frame_that_still_waits_for_its_time_at_the_end_is_counted() -> None:
     settings = changed(stamping=EXPOSED, sync_bit=None)
     device = Device(Result(0))
     with grabbing(device, settings) as grab:
@@ -254,7 +254,7 @@ def test_a_frame_that_still_waits_for_its_time_at_the_end_is_counted(until: Unti
         assert (grab.counts.unstamped, grab.counts.lost) == (1, 1)
 
 
-def test_a_full_queue_waits_for_its_reader_and_loses_nothing(until: Until) -> None:
+def test_a_full_queue_waits_for_its_reader_and_loses_nothing() -> None:
     with grabbing(Device(*map(Result, range(10))), changed(queue=4)) as grab:
         until(lambda: grab.counts.grabbed == 4)
         got = [frame.number for frame in grab.take()]
@@ -265,7 +265,7 @@ def test_a_full_queue_waits_for_its_reader_and_loses_nothing(until: Until) -> No
         assert got == list(range(10))
 
 
-def test_a_pylon_that_hangs_is_an_error(until: Until, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pylon_that_hangs_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sliplab.plugins.devices.basler.grabbing.HANG_S", 0.3)
     go = threading.Event()
     device = Device()
@@ -276,7 +276,7 @@ def test_a_pylon_that_hangs_is_an_error(until: Until, monkeypatch: pytest.Monkey
         go.set()
 
 
-def test_whatever_pylon_raises_is_a_rigs_error(until: Until) -> None:
+def test_whatever_pylon_raises_is_a_rigs_error() -> None:
     device = Device()
     with grabbing(device) as grab:
         device.error = RuntimeError("the driver is confused")

@@ -24,10 +24,9 @@ from sliplab.plugins.devices.dvxplorer.source import (
 )
 from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.storage.streams import I64, EventChunk
+from tests.rigs.waiting import until
 
 pytestmark = pytest.mark.realtime
-
-Until = Callable[[Callable[[], bool]], None]
 
 
 def random_events(count: int, every_us: int = 5, seed: int = 3) -> EventChunk:
@@ -50,9 +49,7 @@ def listening(server: DvxplorerServer, **changes: Any) -> Iterator[DvxplorerCame
         camera.close()
 
 
-def all_of(
-    camera: DvxplorerCamera, server: DvxplorerServer, until: Until
-) -> tuple[EventChunk, I64, Sent]:
+def all_of(camera: DvxplorerCamera, server: DvxplorerServer) -> tuple[EventChunk, I64, Sent]:
     """Let it send, and read while it comes."""
     chunks, pulses = [], []
     server.go()
@@ -70,7 +67,7 @@ def all_of(
     return EventChunk.concatenate(chunks), np.concatenate(pulses), sent
 
 
-def test_nothing_is_lost_and_all_is_exact(until: Until) -> None:
+def test_nothing_is_lost_and_all_is_exact() -> None:
     chunk = random_events(200_000)
     pulses = np.arange(chunk.t_us[0] + 7, chunk.t_us[-1], 2000)
     source = partial(arrays, chunk, pulses, 2000)
@@ -78,7 +75,7 @@ def test_nothing_is_lost_and_all_is_exact(until: Until) -> None:
         assert isinstance(camera, EventCamera)
         assert (camera.width, camera.height) == (640, 480)
         camera.start()
-        came, edges_ns, sent = all_of(camera, server, until)
+        came, edges_ns, sent = all_of(camera, server)
         assert (sent.events, sent.pulses) == (len(chunk), len(pulses))
         for name, dtype in (("x", "u2"), ("y", "u2"), ("p", "u1"), ("t_us", "i8")):
             assert getattr(came, name).dtype == dtype
@@ -89,19 +86,19 @@ def test_nothing_is_lost_and_all_is_exact(until: Until) -> None:
         assert camera.describe()["counts"]["events"] == sent.events
 
 
-def test_a_scene_in_real_time(until: Until) -> None:
+def test_a_scene_in_real_time() -> None:
     source = partial(scene, 0.4)
     expected = list(scene(0.4))
     with DvxplorerServer(source) as server, listening(server) as camera:
         camera.start()
-        came, edges_ns, sent = all_of(camera, server, until)
+        came, edges_ns, sent = all_of(camera, server)
         assert sent.seconds >= 0.3
         assert np.array_equal(came.t_us, np.concatenate([events.t_us for events, _ in expected]))
         assert np.array_equal(edges_ns, 1000 * np.concatenate([pulse for _, pulse in expected]))
         assert len(came) > 1000
 
 
-def test_a_stalled_camera_is_noticed_and_may_come_back(until: Until) -> None:
+def test_a_stalled_camera_is_noticed_and_may_come_back() -> None:
     chunk = random_events(20_000)
     source = partial(arrays, chunk, np.empty(0, np.int64), 10_000)
     with (
@@ -128,7 +125,7 @@ def test_a_stalled_camera_is_noticed_and_may_come_back(until: Until) -> None:
         until(lambda: camera.counts.events == len(chunk))
 
 
-def test_a_cut_connection_is_an_error_after_what_came(until: Until) -> None:
+def test_a_cut_connection_is_an_error_after_what_came() -> None:
     chunk = random_events(5000)
     source = partial(arrays, chunk, np.empty(0, np.int64), 10_000)
     with DvxplorerServer(source, realtime=False) as server, listening(server) as camera:
@@ -207,7 +204,7 @@ def fed(given: Batches | None = None, **settings: Any) -> Iterator[tuple[Dvxplor
         camera.close()
 
 
-def test_what_came_before_the_start_is_dropped_and_after_the_stop_too(until: Until) -> None:
+def test_what_came_before_the_start_is_dropped_and_after_the_stop_too() -> None:
     with fed() as (camera, batches):
         batches.events.append(store(1, 2, 3))
         until(lambda: camera.counts.before == 3)
@@ -228,7 +225,7 @@ def test_a_closed_camera_does_not_start() -> None:
             camera.start()
 
 
-def test_gaps_are_counted(until: Until) -> None:
+def test_gaps_are_counted() -> None:
     with fed(gap_s=0.001) as (camera, batches):
         camera.start()
         batches.events += [store(0, 10, 1011), store(2500)]
@@ -236,7 +233,7 @@ def test_gaps_are_counted(until: Until) -> None:
         assert (camera.counts.gaps, camera.counts.longest_gap_us) == (2, 1489)
 
 
-def test_a_clock_that_falls_back_ends_the_run(until: Until) -> None:
+def test_a_clock_that_falls_back_ends_the_run() -> None:
     with fed() as (camera, batches):
         camera.start()
         batches.events += [store(100, 200), store(150)]
@@ -246,7 +243,7 @@ def test_a_clock_that_falls_back_ends_the_run(until: Until) -> None:
             until(lambda: camera.read() is None)
 
 
-def test_only_rising_edges_are_pulses_and_a_reset_ends_the_run(until: Until) -> None:
+def test_only_rising_edges_are_pulses_and_a_reset_ends_the_run() -> None:
     kinds = dv.TriggerType
     with fed() as (camera, batches):
         camera.start()
@@ -263,7 +260,7 @@ def test_only_rising_edges_are_pulses_and_a_reset_ends_the_run(until: Until) -> 
             until(lambda: camera.read_pulses() is None)
 
 
-def test_memory_is_bounded_and_what_does_not_fit_is_counted(until: Until) -> None:
+def test_memory_is_bounded_and_what_does_not_fit_is_counted() -> None:
     with fed(buffer_mb=1.0) as (camera, batches):
         camera.start()
         batch = store(*range(50_000))
@@ -274,7 +271,7 @@ def test_memory_is_bounded_and_what_does_not_fit_is_counted(until: Until) -> Non
             camera.read()
 
 
-def test_the_noise_filter_is_off_unless_it_is_asked_for(until: Until) -> None:
+def test_the_noise_filter_is_off_unless_it_is_asked_for() -> None:
     with fed(noise_filter_us=1000) as (camera, batches):
         camera.start()
         batches.events.append(store(1000))  # nothing near it
@@ -355,14 +352,14 @@ def test_a_threshold_that_the_camera_does_not_take_is_refused() -> None:
 
 
 @pytest.mark.parametrize("times_us", [(), (100, 100)], ids=["no event", "a clock that stopped"])
-def test_batches_that_show_no_life_are_silence(until: Until, times_us: tuple[int, ...]) -> None:
+def test_batches_that_show_no_life_are_silence(times_us: tuple[int, ...]) -> None:
     with fed(Endless(lambda: store(*times_us)), stall_s=0.3) as (camera, _):
         camera.start()
         with pytest.raises(RigError, match="its clock has stopped for"):
             until(lambda: camera.read() is None)
 
 
-def test_repeated_and_other_triggers_are_silence(until: Until) -> None:
+def test_repeated_and_other_triggers_are_silence() -> None:
     rising, other = dv.Trigger(7, dv.TriggerType(1)), dv.Trigger(9, dv.TriggerType(2))
     with fed(stall_s=0.3) as (camera, batches):
         camera.start()
@@ -374,7 +371,7 @@ def test_repeated_and_other_triggers_are_silence(until: Until) -> None:
         assert camera.counts.other_triggers > 2
 
 
-def test_event_outside_of_the_sensor_is_a_fault(until: Until) -> None:
+def test_event_outside_of_the_sensor_is_a_fault() -> None:
     outside = dv.EventStore()
     outside.push_back(10, 640, 6, True)
     with fed() as (camera, batches):

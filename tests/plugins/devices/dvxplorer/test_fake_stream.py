@@ -22,6 +22,7 @@ from sliplab.plugins.devices.dvxplorer.fake_stream import (
     triggers_packet,
 )
 from sliplab.storage.streams import EventChunk
+from tests.rigs.waiting import free_port
 
 _WRITER = """
 import os, sys
@@ -47,9 +48,7 @@ os._exit(0)  # taking a writer down may wait for ever
 
 def library_bytes(kind: str, count: int) -> bytes:
     """The first `count` bytes that dv-processing's writer sends."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-c", _WRITER, str(port), kind]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any
@@ -30,9 +30,9 @@ from sliplab.plugins.devices.dvxplorer.settings import DvxplorerSettings, Networ
 from sliplab.plugins.devices.dvxplorer.source import find_camera
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.streams import EventChunk
+from tests.rigs.waiting import until
 
 pytestmark = pytest.mark.realtime
-Until = Callable[[Callable[[], bool]], None]
 EVENTS = events_header((640, 480), "somebody")
 TRIGGERS = triggers_header("somebody")
 ONE = EventChunk(
@@ -41,6 +41,7 @@ ONE = EventChunk(
     np.array([1], np.uint8),
     np.array([1000], np.int64),
 )
+
 WITHIN_S = 30.0
 """Bound of an opening in these tests, s: `event_process.OPEN_S` and time for a busy computer."""
 
@@ -168,9 +169,7 @@ def garbage(packet: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("data", [garbage(events_packet(ONE)), struct.pack("<ii", 0, -5) * 9])
-def test_bytes_that_are_no_packet_end_the_run_and_not_the_process(
-    data: bytes, until: Until
-) -> None:
+def test_bytes_that_are_no_packet_end_the_run_and_not_the_process(data: bytes) -> None:
     with ports((EVENTS,)) as (port, settings):
         camera = DvxplorerCamera(settings)
         try:
@@ -188,7 +187,7 @@ def test_bytes_that_are_no_packet_end_the_run_and_not_the_process(
             camera.close()
 
 
-def test_a_packet_that_never_ends_is_silence(until: Until) -> None:
+def test_a_packet_that_never_ends_is_silence() -> None:
     with ports((EVENTS,)) as (port, settings):
         camera = DvxplorerCamera(settings.model_copy(update={"stall_s": 0.5}))
         try:

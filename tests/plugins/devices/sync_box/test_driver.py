@@ -20,8 +20,9 @@ from sliplab.plugins.devices.sync_box.line import NAME, LineReader, seal, unseal
 from sliplab.plugins.devices.sync_box.port import JOIN_S, TRIES, SyncBoxFault
 from sliplab.plugins.devices.sync_box.settings import SyncBoxSettings
 from sliplab.protocols.timing import Code
-from sliplab.rigs.core.capabilities import RigError, SyncBox
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.pulse_code import code_bits
+from tests.rigs.waiting import fault_of
 
 pytestmark = pytest.mark.realtime
 
@@ -68,22 +69,6 @@ def running(box: SerialSyncBox, rate_hz: float, pulses: int) -> None:
     pulses_of(box, pulses)
 
 
-def fault_of(call: Callable[[], object], bound_s: float) -> str:
-    """The text of the fault in which `call`, again and again, ends within a bound."""
-    begin = time.monotonic()
-    while time.monotonic() - begin < bound_s + SLACK_S:
-        try:
-            call()
-        except SyncBoxFault as fault:
-            return str(fault)
-        threading.Event().wait(0.005)
-    pytest.fail(f"no fault within {bound_s} s")
-
-
-def test_it_is_a_sync_box(box: SerialSyncBox) -> None:
-    assert isinstance(box, SyncBox)
-
-
 @pytest.mark.quick(3)
 @pytest.mark.parametrize("code", CODES)
 @pytest.mark.parametrize("rate_hz", [200.0, 1000.0, 333.333])
@@ -107,12 +92,6 @@ def test_nothing_comes_after_the_stop(box: SerialSyncBox) -> None:
     assert len(box.read_pulses()) == 0
     assert box.read_clock().device_ns[0] > clock, "the clock goes on"
     box.stop()
-
-
-def test_a_new_start_begins_anew(box: SerialSyncBox) -> None:
-    running(box, 200.0, 5)
-    box.start(100.0, SEED, "regular")
-    assert pulses_of(box, 2)[:2].tolist() == [0, 160_000_000]
 
 
 def test_exposures_are_stamped(box: SerialSyncBox) -> None:
@@ -155,7 +134,7 @@ def test_the_clock_may_be_anybodys() -> None:
 def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box: Any) -> None:
     running(box, 100.0, 3)
     wire.reset()
-    assert "restarted" in fault_of(box.read_pulses, 0.2)
+    assert "restarted" in fault_of(box.read_pulses, 0.2 + SLACK_S)
     with pytest.raises(SyncBoxFault, match="restarted"):
         box.read_clock()
     box.stop()
@@ -166,7 +145,7 @@ def test_a_reset_is_told_at_once_and_the_next_start_works(wire: FakeSyncBox, box
 def test_a_reset_whose_word_is_lost_is_silence(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
     wire.reset(announced=False)
-    assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
+    assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S + SLACK_S)
 
 
 def test_a_clock_that_falls_back_is_a_reset(wire: FakeSyncBox, box: SerialSyncBox) -> None:
@@ -181,7 +160,7 @@ def test_a_clock_that_falls_back_is_a_reset(wire: FakeSyncBox, box: SerialSyncBo
 def test_silence_ends_a_train(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     running(box, 100.0, 3)
     wire.silence()
-    assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
+    assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S + SLACK_S)
     wire.silence(False)
     box.start(100.0, SEED)
     assert pulses_of(box, 1)[0] == 0
@@ -201,18 +180,8 @@ def test_a_host_that_was_busy_has_not_heard_a_silence(wire: FakeSyncBox, box: An
 def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -> None:
     box.start(100.0, SEED)
     wire.silence()
-    text = fault_of(getattr(box, ask), TRIES * ANSWER_S)
+    text = fault_of(getattr(box, ask), TRIES * ANSWER_S + SLACK_S)
     assert "start the trial again" in text
-
-
-def test_a_late_answer_is_not_taken_for_that_of_the_next_try(wire: FakeSyncBox, box: Any) -> None:
-    box.connect()
-    first = box.read_clock()
-    wire.answer_late()
-    second = box.read_clock()
-    passed_ns = int(second.device_ns[0] - first.device_ns[0])
-    assert passed_ns >= int(second.before_ns[0] - first.after_ns[0]) - 1000
-    assert passed_ns <= int(second.after_ns[0] - first.before_ns[0]) + 1000
 
 
 def test_one_garbled_answer_is_asked_for_again(wire: FakeSyncBox, box: SerialSyncBox) -> None:
@@ -318,7 +287,7 @@ def test_the_stand_in_survives_nonsense(wire: FakeSyncBox, box: SerialSyncBox, l
 def test_an_unplugged_box(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
     wire.close()
-    assert "connection broke" in fault_of(box.read_pulses, 0.3)
+    assert "connection broke" in fault_of(box.read_pulses, 0.3 + SLACK_S)
     with pytest.raises(SyncBoxFault, match="cannot open"):
         box.start(100.0, SEED)
 
@@ -330,7 +299,7 @@ def test_no_such_port() -> None:
 
 def test_nobody_answers(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     wire.silence()
-    assert "no answer on" in fault_of(box.connect, 1.0 + ANSWER_S)
+    assert "no answer on" in fault_of(box.connect, 1.0 + ANSWER_S + SLACK_S)
 
 
 def test_another_device_answers(wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: Any) -> None:
@@ -346,13 +315,6 @@ def test_another_device_answers(wire: FakeSyncBox, box: SerialSyncBox, monkeypat
 def test_a_train_that_cannot_be_sent(box: Any, rate_hz: float, seed: int, word: str) -> None:
     with pytest.raises(RigError, match=word):
         box.start(rate_hz, seed)
-
-
-def test_closing_twice_and_before_opening(box: SerialSyncBox) -> None:
-    box.close()
-    box.start(100.0, SEED)
-    box.close()
-    box.close()
 
 
 CHATTER = {
@@ -401,7 +363,7 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
 ) -> None:
     running(box, 200.0, 5)
     wire._say = lambda body: os.write(wire._master, b"no line at all\n") and None  # type: ignore[method-assign]
-    assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
+    assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S + SLACK_S)
     assert box.losses.lines > 10
 
 
@@ -466,12 +428,12 @@ def test_a_clock_that_falls_back_in_a_train_ends_it(box: SerialSyncBox) -> None:
         running(box, 200.0, 5)
         box.read_clock()
         shift[0] = 250_000_000
-        assert "jumped back by 0.2" in fault_of(box.read_clock, 0.1)
-        assert "restarted" in fault_of(box.read_pulses, 0.1)
+        assert "jumped back by 0.2" in fault_of(box.read_clock, 0.1 + SLACK_S)
+        assert "restarted" in fault_of(box.read_pulses, 0.1 + SLACK_S)
         shift[0] = 0
         running(box, 200.0, 5)
         shift[0] = 4_294_967_296_000  # nobody reads the clock: no tick is due any more
-        assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
+        assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S + SLACK_S)
         box.close()
 
 

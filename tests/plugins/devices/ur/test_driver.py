@@ -25,16 +25,11 @@ from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
 from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.storage.streams import PoseChunk
+from tests.plugins.devices.arms import at
 from tests.plugins.devices.conftest import MakeArm, MakeRobot, MakeUr, ur_settings
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
-
-DOWN = HOME.rotvec_deg
-
-
-def at(y_mm: float, z_mm: float = 300.0) -> Pose:
-    return Pose((400.0, y_mm, z_mm), DOWN)
 
 
 def follow(arm: UrArm, *segments: Segment, within_s: float = 30.0) -> tuple[tuple[int, int], ...]:
@@ -222,13 +217,6 @@ def _refuses(arm: UrArm, why: str) -> bool:
         return why in str(error)
     arm.stop()
     return False
-
-
-def test_a_moving_arm_takes_no_second_path(robot_of: MakeRobot, arm_on: MakeArm) -> None:
-    arm = arm_on(robot_of())
-    arm.start([Segment(at(15.0), 1.6)])
-    with pytest.raises(RigError, match="still moving"):
-        arm.start([Segment(at(0.0), 1.6)])
 
 
 @pytest.mark.long

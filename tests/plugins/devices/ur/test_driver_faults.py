@@ -14,7 +14,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -30,32 +29,13 @@ from sliplab.plugins.devices.ur.settings import RTDE_PORT
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
 from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Fault, Kind, Stage
 from sliplab.rigs.core.pose import distance_mm
+from tests.plugins.devices.arms import BUSY_S, SLIDE, at, fails, sliding
 from tests.plugins.devices.conftest import MakeArm, MakeRobot, MakeUr, reconnect, ur_settings
 from tests.rigs.waiting import own_address, until
 
 pytestmark = pytest.mark.realtime
 
-BUSY_S = 3.0
-"""Allowance for a busy machine in addition to a timeout, s."""
-TARGET = Pose((400.0, 15.0, 300.0), HOME.rotvec_deg)
-SLIDE = [Segment(TARGET, 1.6)]
-
-
-def sliding(arm: UrArm, robot: Any) -> tuple[Any, Any]:
-    """Start a slide, and wait until the arm moves."""
-    arm.start(SLIDE)
-    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
-    return arm, robot
-
-
-def fails(action: Callable[[], object], within_s: float, match: str) -> float:
-    """An ArmFault in time; how long it took, s."""
-    began = time.monotonic()
-    with pytest.raises(ArmFault, match=match):
-        action()
-    took = time.monotonic() - began
-    assert took < within_s + BUSY_S
-    return took
+TARGET = at(15.0)
 
 
 @pytest.mark.quick(2)

@@ -10,27 +10,13 @@ import pytest
 from sliplab.plugins.devices.ur import WRENCH_DRIVER
 from sliplab.plugins.devices.ur.rtde import OUTPUTS
 from sliplab.plugins.devices.ur.settings import UrWrenchSettings
-from sliplab.plugins.devices.ur.wrench import UrWrench
 from sliplab.rigs.core.capabilities import ForceSensor, RigError
 from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.storage.streams import WrenchChunk
 from tests.plugins.devices.conftest import MakeUr
-from tests.rigs.waiting import until
+from tests.rigs.waiting import fault_of, gather
 
 pytestmark = pytest.mark.realtime
-
-
-def gather(sensor: UrWrench, rows: int) -> WrenchChunk:
-    parts: list[WrenchChunk] = []
-
-    def enough() -> bool:
-        parts.append(sensor.read())
-        return sum(map(len, parts)) >= rows
-
-    until(enough, 5.0)
-    fields = ("t_ns", "host_ns", "force_n", "torque_nm")
-    return WrenchChunk(*(np.concatenate([getattr(p, field) for p in parts]) for field in fields))
 
 
 def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
@@ -44,7 +30,7 @@ def test_it_reads_the_wrench_with_the_arms_times(ur_pair: MakeUr) -> None:
     assert len(sensor.read()) == 0
     arm.read_poses()
     sensor.start()
-    found = gather(sensor, 40)
+    found = gather(sensor.read, 40)
     poses = arm.read_poses()
     assert np.all(np.diff(found.t_ns) == 8_000_000)
     assert np.isin(found.t_ns, poses.t_ns).all()
@@ -61,7 +47,7 @@ def test_the_plates_reaction_is_the_force_on_the_plate(ur_pair: MakeUr) -> None:
     sensor = WRENCH_DRIVER.build(UrWrenchSettings(), arm)
     arm.connect()
     sensor.start()
-    on_plate = np.array(frame.force_matrix(sensor.mounting)) @ gather(sensor, 3).force_n[-1]
+    on_plate = np.array(frame.force_matrix(sensor.mounting)) @ gather(sensor.read, 3).force_n[-1]
     assert on_plate == pytest.approx([0.5, 0.0, 3.0], abs=1e-9)
 
 
@@ -72,7 +58,7 @@ def test_zero_takes_the_load_away(ur_pair: MakeUr) -> None:
     arm.connect()
     sensor.connect()
     sensor.start()
-    assert gather(sensor, 10).force_n[-1] == pytest.approx([0.0, 0.0, 0.0])
+    assert gather(sensor.read, 10).force_n[-1] == pytest.approx([0.0, 0.0, 0.0])
     assert robot.program.refused == []
 
 
@@ -83,17 +69,9 @@ def test_a_lost_link_is_a_fault(ur_pair: MakeUr) -> None:
         sensor.connect()
     arm.connect()
     sensor.start()
-    gather(sensor, 5)
+    gather(sensor.read, 5)
     robot.inject(Kind.LINK_CUT)
-
-    def lost() -> bool:
-        try:
-            sensor.read()
-        except RigError:
-            return True
-        return False
-
-    until(lost, 5.0)
+    fault_of(sensor.read, 5.0)
 
 
 def test_an_arm_without_it_is_asked_for_nothing_more(ur_pair: MakeUr) -> None:

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from jsonschema import Draft7Validator
-from typer.testing import CliRunner
 
 import sliplab
 from sliplab.analysis.campaigns import Collected, collected
-from sliplab.flows.cli.app import command_line
 from sliplab.flows.planning.json_schemas import file_schema
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin import worlds
@@ -32,8 +31,10 @@ from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import IMPORTED, Store, StoreError
+from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
+from tests.plugins.twin.test_calibrate import everywhere
 from tests.storage.formats.files import lab_hdf5
 
 
@@ -93,35 +94,23 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
         values[FRICTION] *= friction[slides[0].trial]
         return of(values, np.random.default_rng(int(1e6 * friction[slides[0].trial])))
 
-    def everywhere(title: str, work: Any, jobs: Sequence[Any], done: Any = None) -> list[Any]:
-        found = [work(job) for job in jobs]
-        for number, one in enumerate(found):
-            done(number, one)
-        return found
-
     monkeypatch.setattr(worlds, "everywhere", everywhere)
     monkeypatch.setattr(worlds.DrawnWorld, "statistics", world)
     monkeypatch.setattr(drift, "statistics", reference)
     return friction
 
 
+def calibrated(store: Store, out: Path, *more: object) -> CompletedProcess[str]:
+    """Run the command."""
+    words = ("calibrate", "drift", store.folder, "--rig", "rehearsal", "--worlds", 100)
+    return here(*words, "--out", out, *more)
+
+
 def test_friction_that_falls_is_found_and_nothing_else(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
-    words = [
-        "calibrate",
-        "drift",
-        str(store.folder),
-        "--rig",
-        "rehearsal",
-        "--worlds",
-        "100",
-        "--out",
-        str(tmp_path / "out"),
-        "--json",
-    ]
-    done = CliRunner().invoke(command_line(), [*words, "--limit", "20"])
-    assert done.exit_code == 0, done.output
+    done = calibrated(store, tmp_path / "out", "--json", "--limit", 20)
+    assert done.returncode == 0, done.stderr
     fit = DriftFit.load(tmp_path / "out" / "drift.json")
     assert [it.key for it in fit.parameters if it.changed] == [FRICTION]
     friction = fit.friction
@@ -143,24 +132,9 @@ def test_friction_that_falls_is_found_and_nothing_else(
 def test_a_limit_that_is_exceeded_is_exit_1(
     store: Store, worn: dict[str, float], tmp_path: Path
 ) -> None:
-    done = CliRunner().invoke(
-        command_line(),
-        [
-            "calibrate",
-            "drift",
-            str(store.folder),
-            "--rig",
-            "rehearsal",
-            "--worlds",
-            "100",
-            "--out",
-            str(tmp_path),
-            "--limit",
-            "5",
-        ],
-    )
-    assert done.exit_code == 1
-    said = " ".join(done.output.split())
+    done = calibrated(store, tmp_path, "--limit", 5)
+    assert done.returncode == 1
+    said = " ".join((done.stdout + done.stderr).split())
     assert "6 simulated reference trials; at most 5 % is allowed. The skin wears" in said
     assert "kinetic friction" in said
     assert "more than 5" in (tmp_path / "drift.html").read_text()
@@ -196,7 +170,7 @@ def test_imported_campaigns_and_other_motions_have_no_drift(
 ) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     words = ["import", tmp_path / "slide.h5", "--store", tmp_path / "s", "--name", "theirs"]
-    assert CliRunner().invoke(command_line(), [*map(str, words)]).exit_code == 0
+    assert here(*words).returncode == 0
     with pytest.raises(StoreError, match="imported without an adapter"):
         fitted(tmp_path / "s")
     (item,) = collected(store, None)

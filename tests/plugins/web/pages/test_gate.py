@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 
 import pytest
 from starlette.routing import Mount, Route
-from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from sliplab.flows.running.same_origin import SameOrigin
 from sliplab.plugins.web.pages.access import OPEN, Access
 from sliplab.plugins.web.pages.app import application
 from sliplab.plugins.web.pages.web import Web
-from sliplab.plugins.web.server.links import Role
 from sliplab.storage.trials.store import Store
-from tests.plugins.web.pages.opened import ACCESS, csrf
+from tests.plugins.web.pages.opened import ACCESS, csrf, opened
 from tests.storage.trial_files import campaign, commit
 
 PORT = 4300
 OWN = f"http://127.0.0.1:{PORT}"
+browser = partial(opened, port=PORT)
 CHANGES = ("POST", "PUT", "PATCH", "DELETE")
 STREAM = "/live"
 """It does not end: `test_live` reads it."""
@@ -53,15 +52,6 @@ def store(tmp_path: Path) -> Store:
     return Store.open(tmp_path / "store")
 
 
-def browser(store: Store, role: Role | None) -> TestClient:
-    """A browser at the page's own address that opened the link of a role, or none."""
-    app = SameOrigin(application(Web(store, ACCESS)), PORT)
-    found = TestClient(app, base_url=OWN, follow_redirects=False)
-    if role is not None:
-        assert found.get(f"/enter?token={ACCESS.tokens[role]}").status_code == 200
-    return found
-
-
 def contents(store: Store) -> dict[str, str]:
     """A digest of every file of a store but the catalogue, which is made of the others."""
     return {
@@ -87,7 +77,7 @@ def test_foreign_page_and_foreign_name_get_nothing(
     """
     origins = cycle(("http://evil.example", "null", "http://127.0.0.1:4301", ""))
     hosts = cycle(("evil.example", "127.0.0.1", "127.0.0.1:1", "localhost", ""))
-    operator = browser(store, "operator")
+    operator = browser(store)
     known = {"x-csrf-token": csrf(operator, OWN)}
     before = contents(store)
     for path in table:
@@ -101,7 +91,7 @@ def test_foreign_page_and_foreign_name_get_nothing(
 
 
 def test_without_a_link_there_is_no_page(store: Store, table: dict[str, set[str]]) -> None:
-    stranger, before = browser(store, None), contents(store)
+    stranger, before = browser(store, role=None), contents(store)
     forged = Access({"operator": "x" * 40, "reader": "y" * 40}).cookie("operator")
     for cookie in ("", forged, "operator..", "operator.a.b"):
         stranger.cookies.clear()
@@ -119,7 +109,7 @@ def test_without_a_link_there_is_no_page(store: Store, table: dict[str, set[str]
 
 
 def test_every_websocket_is_refused(store: Store, table: dict[str, set[str]]) -> None:
-    operator = browser(store, "operator")
+    operator = browser(store)
     for path in table:
         for origin in ({}, {"origin": "http://evil.example"}):
             with (
@@ -132,7 +122,10 @@ def test_every_websocket_is_refused(store: Store, table: dict[str, set[str]]) ->
 
 def test_reader_can_do_nothing(store: Store, table: dict[str, set[str]]) -> None:
     """Neither by a form's token of the reader's own, nor by the operator's; pages have no form."""
-    reader, operator = browser(store, "reader"), browser(store, "operator")
+    reader, operator = (
+        browser(store, role="reader"),
+        browser(store),
+    )
     before = contents(store)
     fields = {"who": "Eve", "why": "x", "text": "x", "trials": "a", "protocol": "pilot.yaml"}
     for path in table:
@@ -156,7 +149,10 @@ def test_reader_can_do_nothing(store: Store, table: dict[str, set[str]]) -> None
 def test_operator_changes_nothing_without_the_forms_token(
     store: Store, table: dict[str, set[str]]
 ) -> None:
-    operator, other = browser(store, "operator"), browser(store, "operator")
+    operator, other = (
+        browser(store),
+        browser(store),
+    )
     before = contents(store)
     fields = {"who": "Eve", "why": "x", "text": "x", "trials": "a"}
     for path in table:
@@ -172,7 +168,7 @@ def test_operator_changes_nothing_without_the_forms_token(
 
 
 def test_looking_changes_no_byte(store: Store, table: dict[str, set[str]]) -> None:
-    operator = browser(store, "operator")
+    operator = browser(store)
     before = contents(store)
     for path, methods in table.items():
         if path != STREAM and "GET" in methods:

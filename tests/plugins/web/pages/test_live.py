@@ -19,7 +19,7 @@ from sliplab.plugins.web.pages.web import Web
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Store
-from tests.plugins.web.pages.test_access import ACCESS, client, csrf
+from tests.plugins.web.pages.opened import ACCESS, csrf, opened
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_event_keeps_lines() -> None:
 
 
 def test_pause_and_resume_by_two_people_are_in_the_log(store: Store) -> None:
-    anna, ben = client(store, "operator"), client(store, "operator")
+    anna, ben = opened(store), opened(store)
     assert act(anna, "pause", why="lens dirty") == 422  # without a name
     assert act(anna, "pause", who="Anna", why="lens dirty") == 303
     paused = control.paused(store)
@@ -109,18 +109,18 @@ def test_pause_and_resume_by_two_people_are_in_the_log(store: Store) -> None:
 
 def test_request_to_a_running_collection_does_not_wait(store: Store) -> None:
     with exclusive(store.folder / STORE_LOCK, "the store"):
-        assert act(client(store, "operator"), "pause", who="Anna") == 303
+        assert act(opened(store), "pause", who="Anna") == 303
         assert len(control.open_requests(store)) == 1
 
 
 def test_stop_needs_no_name_and_is_in_the_log(store: Store) -> None:
-    assert act(client(store, "operator"), "stop") == 303
+    assert act(opened(store), "stop") == 303
     (entry,) = log_entries(store)
     assert (entry.what, entry.who) == ("stop", "the page, operator's link")
 
 
 def test_start_without_a_service_says_the_command(store: Store) -> None:
-    operator = client(store, "operator")
+    operator = opened(store)
     assert "sliplab collect PROTOCOL" in operator.get("/").text
     assert act(operator, "collect", who="Anna", protocol="pilot.yaml") == 422
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -27,6 +24,7 @@ from sliplab.protocols.program import Dwell
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, PulseChunk
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
+from tests.plugins.web.server.serving import until
 
 
 def events(x: list[int], t_us: list[int]) -> EventChunk:
@@ -51,15 +49,6 @@ class Memory:
         self.chunks.append((device, chunk))
 
 
-def until(found: Callable[[], object], limit_s: float = 30.0) -> object:
-    """Return the result of `found` as soon as it is truthy."""
-    end, pause = time.monotonic() + limit_s, threading.Event()
-    while not (answer := found()):
-        assert time.monotonic() < end
-        pause.wait(0.02)
-    return answer
-
-
 @pytest.fixture
 def feed(tmp_path: Path) -> LiveFeed:
     request = make_request(
@@ -78,11 +67,11 @@ def test_viewers_get_trial_phase_line_and_pictures(feed: LiveFeed, tmp_path: Pat
         sink = feed.begin(trial, 1, memory, (64, 48))
         feed.on_step(Dwell("hold", 1.0, True))
         console.say("compiling once for this version")
-        until(lambda: feed.watched)
+        until("a viewer", lambda: feed.watched)
         sink.add("events", events([1, 2, 3], [10, 20, 30]))
         sink.add("frames", frames(image))
         sink.add("sync_box", PulseChunk(np.arange(2, dtype=np.int64)))
-        pictures = json.loads(str(until(lambda: live.read(PICTURES)[1])))
+        pictures = json.loads(str(until("pictures", lambda: live.read(PICTURES)[1])))
         state = json.loads(live.read(STATE)[1])
     assert [name for name, _ in memory.chunks] == ["events", "frames", "sync_box"]
     assert (state["trial"], state["number"], state["attempt"]) == (trial.id, 4, 2)

@@ -6,8 +6,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from sliplab.plugins.web.pages.web import Web
 from sliplab.storage.trials.checksums import read_sums
 from sliplab.storage.trials.store import Store
 from tests.plugins.web.pages.opened import ACCESS
+from tests.plugins.web.server.serving import until
 
 TRIALS, VIEWERS, LIMIT_S = 6, 5, 60.0
 pytestmark = pytest.mark.programs
@@ -78,14 +78,6 @@ def page(store: Store) -> Iterator[int]:
         finally:
             server.should_exit = True
             thread.join(LIMIT_S)
-
-
-def until(what: str, found: Callable[[], object]) -> None:
-    """Wait until it is so."""
-    end, pause = time.monotonic() + LIMIT_S, threading.Event()
-    while not found():
-        assert time.monotonic() < end, what
-        pause.wait(0.02)
 
 
 def data(work: SimulatedSession) -> dict[str, dict[str, str]]:

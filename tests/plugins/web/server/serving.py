@@ -17,7 +17,7 @@ import urllib.error
 import urllib.request
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -42,6 +42,16 @@ def until(
         assert time.monotonic() < end, f"waited {limit_s:g} s for {what}"
         pause.wait(pause_s)
     return answer
+
+
+def processes(*words: str) -> list[int]:
+    """The numbers of the processes with some words among those of their command."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            if {*words} <= {*path.read_text(errors="replace").split("\0")}:
+                found.append(int(path.parent.name))
+    return found
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.plugins.web.server.serving import Page, serving, until
+from tests.plugins.web.server.serving import Page, processes, serving, until
 
 pytestmark = pytest.mark.programs
 
@@ -28,14 +28,7 @@ RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 def process_of(run: str) -> int:
     """The process that carries out a run; 0 where there is none."""
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_text().split("\0")
-        except OSError:  # it has ended meanwhile
-            continue
-        if "sliplab.plugins.web.server.runs" in words and run in words:
-            return int(path.parent.name)
-    return 0
+    return next(iter(processes("sliplab.plugins.web.server.runs", run)), 0)
 
 
 @pytest.fixture(scope="module")

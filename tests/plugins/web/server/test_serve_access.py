@@ -21,6 +21,7 @@ from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.plugins.web.server.serving import EVIL, Service, serving, until
+from tests.rigs.waiting import free_port
 
 pytestmark = pytest.mark.programs
 
@@ -192,9 +193,7 @@ def test_a_run_is_answered_nothing_of_files_elsewhere(served: Service) -> None:
 @pytest.mark.long
 def test_a_permanent_server_needs_a_password_too(served: Service, tmp_path: Path) -> None:
     page_server.refuse_open(served.page.url)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     page_server.refuse_open(f"http://127.0.0.1:{port}/api")  # nobody there: Prefect says so
     own = {"PREFECT_HOME": str(tmp_path), "PREFECT__SERVER_EPHEMERAL": "1"}
     factory = ("--factory", "prefect.server.api.server:create_app")

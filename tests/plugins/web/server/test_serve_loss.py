@@ -11,23 +11,11 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.plugins.web.server.serving import FINAL, Page, serving, until
+from tests.plugins.web.server.serving import FINAL, Page, processes, serving, until
 
 pytestmark = pytest.mark.programs
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
-
-
-def server_of(home: Path) -> int:
-    """The process of the server that has its home there."""
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_text().split("\0")
-        except OSError:  # it has ended meanwhile
-            continue
-        if "sliplab.flows.running.embedded_server" in words and str(home) in words:
-            return int(path.parent.name)
-    raise AssertionError("there is no server")
 
 
 def final(page: Page, run: str) -> str:
@@ -52,7 +40,8 @@ def test_a_served_campaign_goes_on_without_its_server(
     with serving(store, RIG, "lost", None, log, nights) as page:
         run = page.run("collect", protocol=str(protocol))["id"]
         until("a trial", lambda: trials.is_dir() and any(trials.iterdir()))
-        os.kill(server_of(store / ".prefect"), number)
+        (server,) = processes("sliplab.flows.running.embedded_server", str(store / ".prefect"))
+        os.kill(server, number)
         until("all trials", lambda: len(list(trials.iterdir())) == 6)
         said = until("the end", lambda: final(page, run))
         assert said == "COMPLETED", log.read_text()

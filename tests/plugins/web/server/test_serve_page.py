@@ -14,7 +14,7 @@ from sliplab.plugins.web.pages.access import OPEN
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store
 from tests.plugins.web.pages.test_gate import STREAM, routes
-from tests.plugins.web.server.serving import EVIL, Service, until
+from tests.plugins.web.server.serving import EVIL, Service, processes, until
 
 pytestmark = pytest.mark.programs
 
@@ -70,12 +70,4 @@ def test_killed_page_takes_nothing_along_and_comes_again(served: Service) -> Non
 
 def _pages(store: Path) -> list[int]:
     """The numbers of the programs that serve the page of a store."""
-    found = []
-    for line in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = line.read_bytes().split(b"\0")
-        except OSError:  # it ended meanwhile
-            continue
-        if b"page" in words and str(store).encode() in words and b"--socket" in words:
-            found.append(int(line.parent.name))
-    return found
+    return processes("page", str(store), "--socket")

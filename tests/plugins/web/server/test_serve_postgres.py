@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-import socket
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.plugins.web.server.serving import LIMIT_S, Page, serving, until
+from tests.rigs.waiting import free_port
 
 TRIALS = 40
 BIN = max(Path("/usr/lib/postgresql").glob("*/bin"), default=None)
@@ -43,9 +43,7 @@ def database(password: str) -> Iterator[str]:
         pytest.skip("no PostgreSQL: apt-get install postgresql")
     if os.getuid() == 0 and shutil.which("runuser") is None:
         pytest.skip("PostgreSQL does not run as root, and there is no runuser")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     folder = Path(tempfile.mkdtemp(prefix="sliplab-postgres-"))  # where its user may go
     secret = folder / "password"
     secret.write_text(password)
