@@ -112,7 +112,9 @@ def draw(seed: int) -> Story:
         elif (ended or last.get("do") in {"push", "damage"}) and rng.random() < 0.5:
             kind = rng.choice(FOLLOWS.get(last["do"], ("verify",)))
         step = {"do": kind, **STEPS[kind][1](rng, story, trials)}
-        if ended and kind == "damage" and last["do"] == "night":
+        if kind == "damage" and last["do"] == "push":
+            step["where"] = "remote"
+        elif kind == "damage" and ended and last["do"] == "night":
             step["where"] = "incoming"
         steps.append(step)
     return {**story, "steps": steps}
