@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.command_line import answer
 from tests.conftest import ROOT, SMALL
 
 # Prefect reads these when it is imported, which happens when a test module imports a flow
@@ -76,6 +77,14 @@ def prefect_server() -> Iterator[None]:
         patch.setattr(orchestration, "_servers", _real)
         patch.setattr(orchestration, "_lost_servers", set())
         yield
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A detector's calibration for the skin of the rig `rehearsal`."""
+    out = tmp_path_factory.mktemp("skin") / "skin.json"
+    answer("calibrate", "detector", "--rig", "rehearsal", "--out", out, "--hold", 5, "--yes")
+    return out
 
 
 def tiny() -> dict[str, Any]:
