@@ -15,8 +15,8 @@ from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import FORMAT, Store, StoreError
 from tests.command_line import outcome
 from tests.flows.collecting.test_faults import TRACKS, slides
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import write
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import requested, take_all, write
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def flip(path: Path) -> None:
 
 def test_figures_add_up_after_damage(whole: Path) -> None:
     (trials(whole)[0] / "data.h5").write_bytes(b"x")
-    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = requested(whole)
     campaign = Store.open(whole / "store").campaign("tiny")
     counts = run_request.counts(campaign)
     assert (counts["planned"], counts["committed"], counts["missing"]) == (2, 1, 1)
@@ -78,7 +78,7 @@ def test_a_damaged_trial_is_set_aside_and_taken_again(whole: Path) -> None:
 
 def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path) -> None:
     flip(trials(whole)[0] / "data.h5")
-    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = requested(whole)
     with exclusive(whole / "store" / ".lock", "the store"):
         with (
             pytest.raises(Locked, match=r"in use by another program .*pid"),
@@ -102,7 +102,7 @@ def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(whole: Path
             assert (code, found["format"], found["from"]) == (0, FORMAT, [1])
             assert Path(found["copies"][0], "store.json").is_file()
         else:
-            with open_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
+            with open_session(requested(whole)):
                 assert Store.open(whole / "store").format == FORMAT
     code, found, _ = outcome("migrate", whole / "store", "--json")
     assert (code, found["from"]) == (0, [])
@@ -134,4 +134,4 @@ def test_no_path_of_a_protocol_leads_out_of_the_store(whole: Path, name: str) ->
 def test_a_campaign_without_its_description_is_not_begun_anew(whole: Path) -> None:
     (whole / "store" / "campaigns" / "tiny" / "campaign.json").unlink()
     with pytest.raises(StoreError, match=r"campaign.json.*restore it from a copy"):
-        make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+        requested(whole)
