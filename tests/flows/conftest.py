@@ -34,7 +34,7 @@ from sliplab.flows.planning.run_request import (  # noqa: E402
     describe_campaign,
     make_request,
 )
-from sliplab.flows.running import orchestration, parallel_map, run_records  # noqa: E402
+from sliplab.flows.running import orchestration, parallel_map, run_records, stopping  # noqa: E402
 from sliplab.flows.running.embedded_server import ServerError  # noqa: E402
 from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
 from sliplab.flows.study import StudyOutcome, study  # noqa: E402
@@ -85,6 +85,14 @@ def prefect_server() -> Iterator[None]:
         patch.setattr(orchestration, "_servers", _real)
         patch.setattr(orchestration, "_lost_servers", set())
         yield
+
+
+@pytest.fixture(autouse=True)
+def forget() -> Iterator[None]:
+    """No stop request outlives its test."""
+    yield
+    with stopping.signals():
+        pass
 
 
 @pytest.fixture(scope="module")

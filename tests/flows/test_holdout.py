@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -24,20 +23,17 @@ from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
-from tests.flows.conftest import Ran, shape_of, summary_json
+from tests.flows.conftest import shape_of, summary_json
 
 SEEDS = (5, 6)
 """Not the release's: no test may look at its trials."""
 
 
 @pytest.fixture(scope="module")
-def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(own_study: Store) -> Store:
     """A copy of the small study, with four trials held out."""
-    folder = tmp_path_factory.mktemp("holdout") / "store"
-    shutil.copytree(ran[0][0].store, folder)
-    found = Store.open(folder)
-    assert measure_holdout(found, collected(found), 4, seeds=SEEDS)["done"] == 1
-    return found
+    assert measure_holdout(own_study, collected(own_study), 4, seeds=SEEDS)["done"] == 1
+    return own_study
 
 
 def test_the_release_s_seeds_stand_nowhere_else() -> None:

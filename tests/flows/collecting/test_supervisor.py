@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,14 +26,6 @@ from tests.conftest import ROOT
 from tests.crash import campaign as crash
 from tests.flows.collecting.test_session import checksums, session, short
 from tests.flows.conftest import requested
-
-
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No stop request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
 
 
 def supervised(

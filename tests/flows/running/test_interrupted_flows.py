@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -16,14 +15,6 @@ from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import run
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-
-
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
 
 
 def send(number: int) -> None:
