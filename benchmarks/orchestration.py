@@ -77,8 +77,7 @@ def _flows() -> Any:
     from sliplab.flows.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
-    def collect(wanted: Opaque[tuple[range, int, Any]]) -> str:
-        every, size, look = wanted.content
+    def collect(every: range, size: int, look: Any) -> str:
         session: Any = _EmptySession()
         for at in range(0, len(every), size):
             take_trials(Opaque(session), Opaque(every[at : at + size]))
@@ -88,8 +87,8 @@ def _flows() -> Any:
         return str(flow_run.id)
 
     @flow(name="empty", validate_parameters=False, persist_result=False)
-    def empty(wanted: Opaque[None]) -> None:
-        assert wanted.content is None
+    def empty() -> None:
+        pass
 
     return collect, empty
 
@@ -106,12 +105,12 @@ def _compare(trials: int, runs: int) -> Figures:
 
     def through_prefect(name: str, size: int) -> None:
         before = time.process_time() + _server_cpu_s()
-        run_id = run(collect, Opaque((every, size, lambda taken: None)))
+        run_id = run(collect, every, size, lambda taken: None)
         _drained(run_id, -(-trials // size))
         spent[name].append(time.process_time() + _server_cpu_s() - before)
 
     def alone() -> None:
-        run(empty, Opaque(None))
+        run(empty)
 
     one_plan, a_run_each = _bluesky(trials)
     taken = alternate(
@@ -178,7 +177,7 @@ def _memory(long: int) -> Figures:
 
     collect, _ = _flows()
     # in the batches of a collection: so many tasks of nothing at once are more than a server keeps
-    run_id = run(collect, Opaque((range(long), BATCH, look)))
+    run_id = run(collect, range(long), BATCH, look)
     _drained(run_id, -(-long // BATCH))
     (ours, its), (ours_late, its_late) = held[long // 10], held[long]
     return {"memory_growth_mb": ours_late - ours, "server_growth_mb": its_late - its}

@@ -168,12 +168,12 @@ class Store:
             InputError: an argument, or predictions that do not fit, with all their faults.
         """
         from sliplab.flows.evaluations import run_evaluation
-        from sliplab.flows.running import extras, stopping
+        from sliplab.flows.running import stopping
 
         if isinstance(predictions, str):
             predictions = Path(predictions)
         names = None if campaigns is None else list(campaigns)
-        with stopping.signals(), extras.named("Store.evaluate"):
+        with stopping.signals():
             return run_evaluation(
                 self.folder,
                 names,
@@ -236,10 +236,8 @@ class Store:
             ModuleNotFoundError: the extra ``learn`` is not installed.
             InputError, StoreError: as `windows`.
         """
-        from sliplab.flows.running import extras
+        from sliplab.flows.notebook.torch_windows import TorchWindows
 
-        with extras.named("Store.torch_dataset"):
-            from sliplab.flows.notebook.torch_windows import TorchWindows
         table = self._windows(split, windows)
         return TorchWindows(self._counts(table), table)
 
@@ -299,11 +297,9 @@ class Store:
         Raises:
             InputError: there is no such report.
         """
-        from sliplab.flows.running import extras
+        from sliplab.analysis.report.against import load_report
+        from sliplab.flows import report
 
-        with extras.named("Store.report"):
-            from sliplab.analysis.report.against import load_report
-            from sliplab.flows import report
         if against is not None:
             load_report(Path(against))  # wrong input fails before anything is made
         self._run("report", campaigns)
@@ -404,10 +400,8 @@ class Store:
             ModuleNotFoundError: the extra ``report`` is not installed.
         """
         from sliplab.analysis.campaigns import collected
-        from sliplab.flows.running import extras
+        from sliplab.analysis.report.campaign import campaign_figure
 
-        with extras.named("Store.plot"):
-            from sliplab.analysis.report.campaign import campaign_figure
         item = collected(self._store, None if campaign is None else [campaign])[0]
         stream = "frames" if item.missing_stream == "events" else "events"
         return campaign_figure(item, stream, bool(item.info["simulated"]))
@@ -426,10 +420,10 @@ class Store:
         return path
 
     def _run(self, step: str, campaigns: Sequence[str] | None) -> StepResult:
-        from sliplab.flows.running import extras, stopping
+        from sliplab.flows.running import stopping
         from sliplab.flows.steps import run_step
 
-        with stopping.signals(), extras.named(f"Store.{step}"):
+        with stopping.signals():
             return run_step(self.folder, None if campaigns is None else list(campaigns), step)
 
 
@@ -463,10 +457,8 @@ class Model:
         """
         from dataclasses import asdict
 
-        from sliplab.flows.running import extras
+        from sliplab.analysis.report.windows import training_figure
 
-        with extras.named("Model.plot"):
-            from sliplab.analysis.report.windows import training_figure
         history = [asdict(record) for record in self.fitted.history]
         return training_figure(history, self.fitted.chosen_epoch, simulated=self.simulated)
 
@@ -562,10 +554,7 @@ def load_model(path: str | Path) -> Model:
         InputError: the file cannot be read, is not a model, or is damaged.
         ModuleNotFoundError: the extra ``learn`` is not installed.
     """
-    from sliplab.flows.running import extras
-
-    with extras.named("load_model"):
-        from sliplab.flows.detecting.request import load_model as load
+    from sliplab.flows.detecting.request import load_model as load
 
     place = Path(path)
     made_in = place.parent.parent  # of STORE/models/NAME.pt
@@ -604,10 +593,8 @@ def check(
         InputError: protocol or rig file cannot be used at all.
     """
     from sliplab.flows.planning import preflight
-    from sliplab.flows.running import extras
 
-    with extras.named("check"):
-        found = preflight.check(Path(protocol), Path(rig), Path(store), tuple(enable))
+    found = preflight.check(Path(protocol), Path(rig), Path(store), tuple(enable))
     return preflight.checks_json(found)
 
 
@@ -662,19 +649,17 @@ def import_data(
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
     from sliplab.flows.imports import import_data as run
-    from sliplab.flows.running import extras
 
-    with extras.named("import_data"):
-        return run(
-            Path(path),
-            Path(store),
-            kind=kind,
-            name=name,
-            adapter=None if adapter is None else Path(adapter),
-            dry_run=dry_run,
-            simulated=simulated,
-            salvage=salvage,
-        )
+    return run(
+        Path(path),
+        Path(store),
+        kind=kind,
+        name=name,
+        adapter=None if adapter is None else Path(adapter),
+        dry_run=dry_run,
+        simulated=simulated,
+        salvage=salvage,
+    )
 
 
 @checked
@@ -700,12 +685,10 @@ def export(
         ModuleNotFoundError: an extra is not installed; the message says which.
     """
     from sliplab.flows import exports
-    from sliplab.flows.running import extras
 
     given = {name: value for name, value in options.items() if value is not None}
-    with extras.named("export"):
-        request = exports.ExportRequest(str(place), part, form, Path(output), given)
-        return dict(exports.export(request).result)
+    request = exports.ExportRequest(str(place), part, form, Path(output), given)
+    return dict(exports.export(request).result)
 
 
 @checked
@@ -744,7 +727,7 @@ def collect(
     """
     from sliplab.flows.planning.parameters import CollectOptions, made
     from sliplab.flows.planning.run_request import make_request
-    from sliplab.flows.running import extras, stopping
+    from sliplab.flows.running import stopping
     from sliplab.flows.steps import prepare_store
 
     options = made(
@@ -759,7 +742,7 @@ def collect(
         no_stopping=no_stopping,
     )
     run_request = make_request(Path(protocol), Path(rig), Path(store), **options.arguments())
-    with stopping.signals(), extras.named("collect"):
+    with stopping.signals():
         prepare_store(run_request.store)
         from sliplab.flows.collect import collect as take
 

@@ -57,9 +57,8 @@ def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) 
 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
-def collect_flow(run_request: Opaque[RunRequest]) -> CollectResult:
+def collect_flow(request: RunRequest) -> CollectResult:
     """Collect the missing trials of a campaign."""
-    request = run_request.content
     several = "trials from " if request.rig.in_virtual_time else "trial "
     with (
         progress_display(request) as progress,
@@ -107,7 +106,7 @@ def collect(run_request: RunRequest) -> CollectResult:
             carry_out(store)
     if run_request.due_trials(store.campaign(run_request.campaign)):
         check_disk([run_request])
-        return run(collect_flow, Opaque(run_request))
+        return run(collect_flow, run_request)
     campaign = refresh(run_request)
     return {
         **run_request.counts(campaign),

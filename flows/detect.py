@@ -21,6 +21,7 @@ from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.live import LiveDetector, TimedDecision
 from sliplab.analysis.detectors.promise_watch import PromiseWatch
 from sliplab.analysis.networks import training
+from sliplab.flows.collecting.preparation import change_over, find_zero
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
 from sliplab.flows.detecting.sources import NetworkSource
@@ -196,30 +197,14 @@ def _move(request: DetectRequest, rig: Rig, sink: DetectSink) -> Reaction | None
     plan, trial = request.plan, request.trial
     assert plan is not None
     assert trial is not None
-    mass = plan.mass_kg(trial)
-
-    def mounted() -> bool:
-        return mass is None or rig.plate is None or abs(rig.plate.mass_kg() - mass) < 1e-3
-
-    for task in plan.changeovers(None, trial):
-        if task.mounts_plate and mounted():
-            continue
-        if not rig.operator.ask(task.request, task.prompt, task.expected):
-            raise RigError("operator", f"'{task.prompt}' was not confirmed")
-        if task.mounts_plate and not mounted():
-            raise RigError("plate", f"{task.prompt}: the rig detects another mass")
-    collection = plan.protocol.collection
-    rezero = collection.maintenance.rezero
-    if rezero is not None:
-        slot = plan.rezero_task(trial).slot
-        seed = hash_integer(collection.seed, "rezero", slot)
-        rig.rezero(rezero, seed)
+    change_over(rig, plan, None, trial)
+    find_zero(rig, plan, trial)
     return run_watched(
         rig,
         plan.program(trial),
         sink,
         hash_integer(trial.seed, 0),  # a simulated trial is the one that `collect` takes first
-        collection.recording.sync_rate,
+        plan.protocol.collection.recording.sync_rate,
         request.reflex,
         request.safe,
     )

@@ -90,7 +90,7 @@ def evaluate(
         raise InputError("--promise", "", promise, right)
     stale = not Derived.of(store, STEP).fresh(problem.name, job.key)
     if stale:
-        run(evaluate_flow, Opaque((problem, job, cluster)), cluster)
+        run(evaluate_flow, problem, job, cluster, cluster=cluster)
     for other in problem.others():
         stale |= judge(other, cluster)
     folder = Derived.of(store, STEP).folder
@@ -128,9 +128,8 @@ def _promises(job: EvaluationJob, promise: float) -> list[PromisedDetector]:
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
-def evaluate_flow(argument: Opaque[tuple[Problem, Job, Cluster | None]]) -> None:
+def evaluate_flow(problem: Problem, job: Job, cluster: Cluster | None) -> None:
     """Make what is missing of the trials, then evaluate the network."""
-    problem, job, cluster = argument.content
     store = problem.labels.store
     threads = None if cluster is None else 1
     workers = Workers(

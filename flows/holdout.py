@@ -9,9 +9,8 @@ number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
-from pathlib import Path
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation.holdout import NAME, STEP, Holdout
@@ -21,7 +20,6 @@ from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
 from sliplab.flows.steps import StepDone
 from sliplab.storage.schema.holdout import HoldoutResult
-from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store
 
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
@@ -29,29 +27,11 @@ PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
 test, or a search. Replace both after looking at single trials of it."""
 
 
-class HoldoutDone(StepDone):
-    """`HeldOut` for the command line."""
+class HeldOut(StepDone):
+    """The figures of the campaign, and the file that stores them; `done` is 1 if made now."""
 
     file: str
-    result: Json
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """The figures of the campaign, and the file that stores them.
-
-    Attributes:
-        done: 1 where it was evaluated now, else 0.
-    """
-
-    done: int
-    file: Path
     result: HoldoutResult
-
-    def to_json(self) -> HoldoutDone:
-        """Return plain data for the command line."""
-        result = self.result.to_json()
-        return {"step": STEP, "done": self.done, "file": str(self.file), "result": result}
 
 
 def measure_holdout(
@@ -87,7 +67,8 @@ def measure_holdout(
         )
     else:
         done = sweep.run()
-    return HeldOut(done, work.folder / f"{NAME}.json", work.result())
+    file = str(work.folder / f"{NAME}.json")
+    return {"step": STEP, "done": done, "file": file, "result": work.result()}
 
 
 def holdout_request(work: Holdout) -> RunRequest:

@@ -15,7 +15,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
-from sliplab.flows.running.orchestration import Opaque, run
+from sliplab.flows.running.orchestration import run
 from sliplab.flows.running.parallel_map import keep_trials
 from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
@@ -158,14 +158,13 @@ def judge(judgement: Judgement, cluster: Cluster | None) -> bool:
     """Judge a network if anything changed; return True if it did."""
     stale = not judgement.fresh
     if stale:
-        run(judge_flow, Opaque((judgement, cluster)), cluster)
+        run(judge_flow, judgement, cluster, cluster=cluster)
     return stale
 
 
 @flow(name="judge a network", validate_parameters=False, persist_result=False)
-def judge_flow(argument: Opaque[tuple[Judgement, Cluster | None]]) -> None:
+def judge_flow(judgement: Judgement, cluster: Cluster | None) -> None:
     """Count the network's spikes in every test trial, then evaluate it."""
-    judgement, cluster = argument.content
     with timed(judgement.store, "evaluate"):
         judgement.count(spike_keeper(judgement.store, cluster), None if cluster is None else 1)
         networks.score_network(judgement)

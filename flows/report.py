@@ -18,7 +18,7 @@ from sliplab.analysis.report import scores
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import STEP, report_folder
 from sliplab.flows.planning.estimate import plan_bytes
-from sliplab.flows.running.orchestration import Opaque, run
+from sliplab.flows.running.orchestration import run
 from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.steps import StepResult
 from sliplab.rigs.rig_file import load_rig_file
@@ -43,14 +43,13 @@ def report(store: Store, campaigns: list[Collected]) -> StepResult:
     there = [(report_folder(store) / name).exists() for name in ("index.html", scores.FILE)]
     stale = not Derived.of(store, STEP).fresh(STEP, key) or not all(there)
     if stale:
-        run(report_flow, Opaque((problem, key)))
+        run(report_flow, problem, key)
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)
-def report_flow(argument: Opaque[tuple[Problem, str]]) -> None:
+def report_flow(problem: Problem, key: str) -> None:
     """Write the report's page, then its table of scores and its summary."""
-    problem, key = argument.content
     store = problem.labels.store
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)

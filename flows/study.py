@@ -90,7 +90,7 @@ def study(
     run("train", "networks", lambda: train(store, campaigns))
     run("evaluate", "evaluations", lambda: evaluate(store, campaigns))
     if holdout:
-        run(STEP, "evaluations", lambda: measure_holdout(store, campaigns, holdout).to_json())
+        run(STEP, "evaluations", lambda: measure_holdout(store, campaigns, holdout))
     for each in more:
         run(each.name, each.unit, partial(_search, each, store, campaigns))
     run("report", "pages", lambda: report(store, campaigns))

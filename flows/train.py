@@ -43,11 +43,8 @@ def train_one(job: Opaque[tuple[Problem, ModelOnDisk, Any, Any, bool]]) -> int:
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)
-def train_flow(
-    argument: Opaque[tuple[Problem, list[ModelOnDisk], Cluster | None]],
-) -> int:
+def train_flow(problem: Problem, models: list[ModelOnDisk], cluster: Cluster | None) -> int:
     """Train the missing and stale seeds one after another."""
-    problem, models, cluster = argument.content
     store = problem.labels.store
     simulated = any(r.simulated for item in problem.campaigns for _, r in item.trials[:1])
     with timed(store, "train"):
@@ -84,7 +81,7 @@ def train(
     stale = [model for model in models if not model.fresh]
     if stale:
         problem.check()
-        run(train_flow, Opaque((problem, stale, cluster)), cluster)
+        run(train_flow, problem, stale, cluster, cluster=cluster)
     return {
         "step": "train",
         "done": len(stale),

@@ -81,6 +81,13 @@ def answer(*arguments: object) -> dict[str, Any]:
     return found
 
 
+def outcome(*arguments: object) -> tuple[int, Any, str]:
+    """Run a command in this process: exit code, JSON object (None without --json), messages."""
+    done = here(*arguments)
+    found = json.loads(done.stdout) if "--json" in arguments else None
+    return done.returncode, found, done.stderr
+
+
 def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:
     """Until `condition()` holds; fails when the process ends first or time is up."""
     assert callable(condition)

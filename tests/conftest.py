@@ -76,6 +76,14 @@ def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Any:
 
 
 @pytest.fixture(scope="module")
+def own_study(ran: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A copy of the small study, which a module may change."""
+    from sliplab.storage.trials.store import Store
+
+    return Store.open(shutil.copytree(ran[0][0].store, tmp_path_factory.mktemp("own") / "store"))
+
+
+@pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """Test networks are too small to share: beside other work, waiting threads cost the most."""
     import torch

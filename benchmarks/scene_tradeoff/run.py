@@ -134,6 +134,5 @@ def everywhere(
         found[number] = result
         done()
 
-    task = orchestration.Opaque(("trade-off", work, jobs, keep, cluster))
-    orchestration.run(parallel_map_flow, task, cluster)
+    orchestration.run(parallel_map_flow, "trade-off", work, jobs, keep, cluster, cluster=cluster)
     return [found[number] for number in range(len(jobs))]

@@ -177,11 +177,12 @@ def holdout(
 
     done = measure_holdout(store, campaigns, trials, again)
     if as_json:
-        console.print_json(done.to_json())
+        console.print_json(done)
         return
-    rows = holdout_rows(holdout_part(done.result))
+    rows = holdout_rows(holdout_part(done["result"]))
     console.print_table("hold-out, simulated", COLUMNS, rows)
-    console.say(f"stored in {done.file} with all earlier evaluations; the next report shows it")
+    file = done["file"]
+    console.say(f"stored in {file} with all earlier evaluations; the next report shows it")
 
 
 def _note_seeds(run_requests: Sequence[RunRequest]) -> None:

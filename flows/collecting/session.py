@@ -21,12 +21,13 @@ from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.live_feed import LiveFeed
+from sliplab.flows.collecting.preparation import ask, change_over, find_zero
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
-from sliplab.protocols import Plan, Task, Trial
+from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.program import ACTING, Step
@@ -294,20 +295,11 @@ class TrialCollector:
 
     def _prepare(self, trial: Trial) -> None:
         """Do what the protocol asks for before this trial and this session has not done yet."""
-        self._change_over(trial)
+        change_over(self.rig, self.plan, self._previous, trial)
         for task in self.plan.tasks_before(trial):
             if task.kind == "clean":
-                self._ask(task)
+                ask(self.rig, task)
         self._warm_and_zero(trial)
-
-    def _change_over(self, trial: Trial) -> None:
-        for task in self.plan.changeovers(self._previous, trial):
-            if not task.mounts_plate:
-                self._ask(task)
-            elif not self._mounted(trial):
-                self._ask(task)
-                if not self._mounted(trial):
-                    raise RigError("plate", f"{task.prompt}: the rig detects another mass")
 
     def _warm_and_zero(self, trial: Trial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
@@ -324,18 +316,8 @@ class TrialCollector:
         if maintenance.rezero is not None and self.rig.event_camera is not None:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
-                seed = hash_integer(self.plan.protocol.collection.seed, "rezero", slot)
-                zero = self.rig.rezero(maintenance.rezero, seed)
-                self._zero_slot, self._zero_sd_mm = slot, zero.sd_mm
-
-    def _mounted(self, trial: Trial) -> bool:
-        """Check that the plate that the trial needs hangs on the slider, to a gram."""
-        mass = self.plan.mass_kg(trial)
-        return mass is None or self.rig.plate is None or abs(self.rig.plate.mass_kg() - mass) < 1e-3
-
-    def _ask(self, task: Task) -> None:
-        if not self.rig.operator.ask(task.request, task.prompt, task.expected):
-            raise RigError("operator", f"'{task.prompt}' was not confirmed")
+                zero = find_zero(self.rig, self.plan, trial)
+                self._zero_slot, self._zero_sd_mm = slot, None if zero is None else zero.sd_mm
 
     def _take_with_retakes(self, trial: Trial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
@@ -351,7 +333,7 @@ class TrialCollector:
                 return
             if not self._may_take(trial):
                 return
-            self._change_over(trial)  # needed only after a pause
+            change_over(self.rig, self.plan, self._previous, trial)  # only after a pause
             self._warm_and_zero(trial)
             self.retaken += 1
         self._finish(trial, "committed")

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from sliplab.flows.running import extras
 from sliplab.protocols.errors import InputError
 
 CallableT = TypeVar("CallableT", bound=Callable[..., Any])
@@ -22,7 +23,8 @@ _NO_ARGUMENTS = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
 def checked(function: CallableT) -> CallableT:
     """Return a function that checks its arguments by their annotations.
 
-    Text in place of several names is one name. Numbers must be finite.
+    Text in place of several names is one name, several names are a list. Numbers must be finite.
+    A package that is missing inside is named with its extra (`extras.named`).
     """
     signature = inspect.signature(function)
 
@@ -38,7 +40,8 @@ def checked(function: CallableT) -> CallableT:
             parameter = signature.parameters[name]
             if parameter.kind not in _NO_ARGUMENTS and name != "self":
                 given.arguments[name] = _checked(name, value, str(parameter.annotation))
-        return function(*given.args, **given.kwargs)
+        with extras.named(function.__qualname__):
+            return function(*given.args, **given.kwargs)
 
     return call  # type: ignore[return-value]
 

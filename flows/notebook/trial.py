@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from sliplab.flows.notebook.arguments import checked_methods
 from sliplab.flows.notebook.html import pairs_html
-from sliplab.flows.running import extras
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import one_of
 from sliplab.storage.errors import StoreError
@@ -336,8 +335,8 @@ class Trial:
             ModuleNotFoundError: the extra ``xarray`` is not installed.
             StoreError: the trial is damaged.
         """
-        with extras.named("Trial.to_xarray"):
-            import xarray
+        import xarray
+
         return xarray.Dataset.from_dict(self.to_dict())
 
     def plot(self) -> Figure:
@@ -347,9 +346,8 @@ class Trial:
             StoreError: the trial has no label yet, or no events.
             ModuleNotFoundError: the extra ``report`` is not installed.
         """
-        with extras.named("Trial.plot"):
-            from sliplab.analysis.report.trial import Example, trial_section
         from sliplab.analysis.campaigns import Collected
+        from sliplab.analysis.report.trial import Example, trial_section
         from sliplab.storage.schema.evaluation import TrialScore
 
         item, onsets = Collected(self._store.campaign(self.campaign)), self.onsets()

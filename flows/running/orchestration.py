@@ -67,10 +67,10 @@ _lost_servers: set[str] = set()
 
 
 class Opaque(Generic[T]):
-    """Opaque flow or task argument: Prefect does not validate, walk or store its content.
+    """Opaque argument of a task: Prefect does not validate, walk or store its content.
 
-    Pickled without its content: with a task that runs elsewhere Prefect also sends the arguments
-    of its flow, which that task has no use for.
+    Pickled without its content: with a task that runs elsewhere Prefect also sends its flow, of
+    whose arguments (`run` keeps them opaque) that task has no use.
     """
 
     def __init__(self, content: T) -> None:
@@ -343,19 +343,21 @@ def limited_settings() -> dict[Any, Any]:
 class _Work:
     """The work of a flow run and its outcome, which is available even if its report fails."""
 
-    def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
-        self._do, self._link = do, link
+    def __init__(
+        self, do: Callable[..., Any], arguments: tuple[Any, ...], link: ServerLink
+    ) -> None:
+        self._do, self._arguments, self._link = do, Opaque(arguments), link
         self.started = self._done = False
         self._result: Any = None
         self.error: BaseException | None = None
 
-    def do(self, argument: Any, on_start: Callable[[], None] = lambda: None) -> Any:
+    def do(self, on_start: Callable[[], None] = lambda: None) -> Any:
         """Do it after `on_start`, and keep its result or its error."""
         self.started = True
         try:
             with stopping.signals():  # around a flow Prefect has its own handler of SIGTERM
                 on_start()
-                self._result = self._do(argument)
+                self._result = self._do(*self._arguments.content)
                 self._done = True
         except BaseException as error:
             self.error = error
@@ -390,13 +392,14 @@ class WorkNotBegun(RuntimeError):
     """A flow run ended before its work began."""
 
 
-def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any:
+def run(flow: Any, *arguments: Any, cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Inside a served flow it is part of that flow's run, which reports its own end.
     A server that is lost or cannot be started delays nothing.
 
     Args:
+        arguments: of the flow, which Prefect does not see.
         cluster: where its tasks go that are submitted, instead of threads.
 
     Raises:
@@ -407,9 +410,9 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
     if FlowRunContext.get() is not None:
-        return flow.fn(argument)
+        return flow.fn(*arguments)
     link = ServerLink(run_records.server_name(PREFECT_API_URL.value()))
-    work = _Work(flow.fn, link)
+    work = _Work(flow.fn, arguments, link)
     with ExitStack() as stack:
         try:
             own = embedded().settings() if link.server == run_records.EMBEDDED else {}
@@ -426,8 +429,8 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
                     f"does not answer ({reason_of(error)})"
                 ) from error
             link.mark_lost(str(error) if isinstance(error, ServerError) else error)
-            return _without_server(work.do, argument)
-        return _reported(flow, flow_run, argument, work, link, cluster)
+            return _without_server(work.do)
+        return _reported(flow, flow_run, work, link, cluster)
 
 
 def _in_utf8(name: str) -> str:
@@ -436,7 +439,7 @@ def _in_utf8(name: str) -> str:
 
 
 def _reported(
-    flow: Any, flow_run: Any, argument: Any, work: _Work, link: ServerLink, cluster: Cluster | None
+    flow: Any, flow_run: Any, work: _Work, link: ServerLink, cluster: Cluster | None
 ) -> Any:
     """Do the work as a flow run that the server knows, and keep in the store how it ended."""
     from prefect import Flow
@@ -449,8 +452,8 @@ def _reported(
         if store is not None:
             run_records.begin(store, run_id, flow.name, link.server)
 
-    def do(argument: Opaque[Any]) -> Any:
-        return work.do(argument, begin)
+    def do() -> Any:
+        return work.do(begin)
 
     reported_flow: Any = Flow(
         do,
@@ -464,7 +467,7 @@ def _reported(
     interrupted: BaseException | None = None
     delivered = False
     try:
-        run_flow(reported_flow, flow_run=flow_run, parameters={"argument": argument})
+        run_flow(reported_flow, flow_run=flow_run)
         delivered = True
     except (PrefectSignal, CancelledRun, PausedRun) as error:  # raised by the server or by the work
         delivered = not work.started or error is work.error
@@ -472,7 +475,7 @@ def _reported(
         if not work.started:
             link.mark_lost(error)
             try:
-                _without_server(do, argument)
+                _without_server(do)
             except BaseException:
                 if not work.started:  # an error of the work is stored, and raised below
                     raise
@@ -494,7 +497,7 @@ def _reported(
     return work.outcome()
 
 
-def _without_server(do: Callable[[Any], Any], argument: Any) -> Any:
+def _without_server(do: Callable[[], Any]) -> Any:
     """Do the work without a server that records it."""
     from prefect.context import SyncClientContext
     from prefect.events.clients import NullEventsClient
@@ -509,7 +512,7 @@ def _without_server(do: Callable[[Any], Any], argument: Any) -> Any:
     EventsWorker.set_client_override(NullEventsClient)
     try:
         with temporary_settings(updates=settings), SyncClientContext():
-            return do(argument)
+            return do()
     finally:
         EventsWorker.set_client_override(None)
 

@@ -92,14 +92,13 @@ def parallel_map(
 
 @flow(name="parallel jobs", validate_parameters=False, persist_result=False)
 def parallel_map_flow(
-    argument: Opaque[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
-) -> int:
-    """Run jobs in parallel, for a caller that is not in a flow.
+    name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluster: Cluster | None = None
+) -> None:
+    """Run jobs as `parallel_map` does, for a caller that is not in a flow.
 
     It is in a module, since Prefect sends a flow along with its tasks.
     """
-    parallel_map(*argument.content)
-    return len(argument.content[2])
+    parallel_map(name, piece, jobs, done, cluster)
 
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
@@ -155,22 +154,6 @@ short is done by then, and what is long takes two starts at the most."""
 
 
 @dataclass(frozen=True)
-class _Step:
-    """A step with its pending work.
-
-    Attributes:
-        name: where its results are stored; title: its display name.
-    """
-
-    store: Store
-    name: str
-    title: str
-    work: list[TrialWork]
-    make: Make
-    cluster: Cluster | None
-
-
-@dataclass(frozen=True)
 class TrialJob:
     """A trial as another process, perhaps on another machine, finds it.
 
@@ -211,19 +194,28 @@ def run_trials(
     make: Make,
     cluster: Cluster | None = None,
 ) -> None:
-    """Make every result of `work` and keep it among the derived results of `step`."""
+    """Make every result of `work` and keep it among the derived results of `step`.
+
+    Args:
+        title: the step's display name.
+    """
     if work:
         named = _trials_flow.with_options(name=title, validate_parameters=False)
-        run(named, Opaque(_Step(store, step, title, work, make, cluster)), cluster)
+        run(named, store, step, title, work, make, cluster, cluster=cluster)
 
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
-def _trials_flow(argument: Opaque[_Step]) -> int:
+def _trials_flow(
+    store: Store,
+    step: str,
+    title: str,
+    work: list[TrialWork],
+    make: Make,
+    cluster: Cluster | None,
+) -> None:
     """Compute missing and stale results of trials."""
-    step = argument.content
-    with timed(step.store, step.title):
-        keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)
-    return len(step.work)
+    with timed(store, title):
+        keep_trials(store, step, title, work, make, cluster)
 
 
 def keep_trials(
@@ -280,11 +272,7 @@ def each_trial(
 
 
 def _find(job: TrialJob) -> None:
-    """Check on a worker that it can read the trial.
-
-    Raises:
-        StoreError: it is not, or is another take of it.
-    """
+    """Check on a worker that it can read the trial. Raises as `_recording`."""
     _recording(job)
 
 
@@ -294,6 +282,7 @@ def make_in_process(job: TrialJob) -> Any:
 
 
 def _recording(job: TrialJob) -> Recording:
+    """Return the trial. Raises StoreError if it cannot be read, or is another take."""
     store = open_for_trial(job.place, job.campaign, job.trial)
     recording = store.campaign(job.campaign).recording(job.trial)
     recording.use_clocks(job.clocks)

@@ -311,6 +311,5 @@ def everywhere(
                 done(number, result)
             bar.advance()
 
-        task = orchestration.Opaque((title, work, worlds, keep, None))
-        orchestration.run(parallel_map_flow, task)
+        orchestration.run(parallel_map_flow, title, work, worlds, keep)
     return [found[number] for number in range(len(worlds))]

@@ -1,4 +1,4 @@
-"""Prophesee's formats in the example package, against the maker's layout and another library."""
+"""Prophesee's formats in the example package; tests/plugins/formats has the words' meaning."""
 
 from __future__ import annotations
 
@@ -11,15 +11,10 @@ import pytest
 from sliplab_prophesee.evt import (
     ADDR_X,
     ADDR_Y,
-    BASE_X,
     EXT_TRIGGER,
     TIME_HIGH,
     TIME_LOW,
-    VECT_8,
-    VECT_12,
     Decoder,
-    Evt2Decoder,
-    Evt3Decoder,
     Evt3Encoder,
     FormatFault,
     Header,
@@ -29,6 +24,7 @@ from sliplab.storage.streams import EventChunk
 
 SIZE = 640, 480
 ON = 1 << 11
+BASE_X, VECT_12, VECT_8 = 0x3, 0x4, 0x5
 
 
 def words(*typed: tuple[int, int]) -> bytes:
@@ -46,30 +42,23 @@ def rows(decoder: Decoder, *parts: bytes) -> list[tuple[int, int, int, int]]:
     ]
 
 
-# before any time: dropped; the low part is 0 until it is sent; a single event leaves the vector's
-# column where it was
 STREAM = words(
     *((ADDR_Y, 9), (ADDR_X, 1), (TIME_HIGH, 2), (ADDR_Y, 100), (ADDR_X, 5), (TIME_LOW, 7)),
     *((ADDR_X, ON | 6), (BASE_X, ON | 20), (VECT_12, 0b1000_0000_0001), (VECT_12, 0b10)),
-    *((VECT_8, 0b1000_0000), (ADDR_X, 3), (VECT_8, 0b1), (TIME_HIGH, 3), (ADDR_Y, 101)),
-    (VECT_8, 0b1),
+    *((ADDR_X, 700), (VECT_8, 0b1000_0000), (TIME_HIGH, 3), (ADDR_Y, 101), (VECT_8, 0b1)),
 )
-PLACES = ((6, 1), (20, 1), (31, 1), (33, 1), (51, 1), (3, 0), (52, 1))
-EVENTS = [(8192, 5, 100, 0), *((8199, x, 100, p) for x, p in PLACES), (12288, 60, 101, 1)]
-
-
-def test_words_mean_what_the_maker_says() -> None:
-    assert rows(Evt3Decoder(), STREAM) == EVENTS
+"""What comes before any time, and what lies outside of the camera, is dropped."""
+EVENTS = [(8192, 5, 100, 0), *((8199, x, 100, 1) for x in (6, 20, 31, 33, 51)), (12288, 52, 101, 1)]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 7])
 def test_a_stream_may_be_cut_anywhere(size: int) -> None:
     parts = [STREAM[at : at + size] for at in range(0, len(STREAM), size)]
-    assert rows(Evt3Decoder(), *parts) == EVENTS
+    assert rows(Decoder(Header(3, SIZE)), *parts) == EVENTS
 
 
 def test_triggers_have_an_input_an_edge_and_a_time() -> None:
-    found = Evt3Decoder().decode(
+    found = Decoder(Header(3, SIZE)).decode(
         words((TIME_HIGH, 1), (TIME_LOW, 5), (EXT_TRIGGER, 1), (TIME_LOW, 9), (EXT_TRIGGER, 6 << 8))
     )
     assert found.trigger_us.tolist() == [4101, 4105]
@@ -77,25 +66,15 @@ def test_triggers_have_an_input_an_edge_and_a_time() -> None:
     assert found.trigger_up.tolist() == [True, False]
     cd = [1 << 28 | 3 << 22 | 40 << 11 | 50, TIME_HIGH << 28 | 11, 10 << 28 | 2 << 22 | 4 << 8 | 1]
     data = np.array([TIME_HIGH << 28 | 10, *cd], "<u4").tobytes()
-    two = Evt2Decoder().decode(data)
+    two = Decoder(Header(2, SIZE)).decode(data)
     assert [two.events.t_us[0], two.events.x[0], two.events.y[0]] == [643, 40, 50]
     assert len(two.events) == 1
     assert (two.trigger_us.tolist(), two.trigger_id.tolist()) == ([706], [4])
     assert two.trigger_up.tolist() == [True]
 
 
-def test_the_time_goes_on_where_its_24_bits_begin_anew() -> None:
-    decoder = Evt3Decoder()
-    found = rows(
-        decoder,
-        words((TIME_HIGH, 4095), (ADDR_Y, 1), (ADDR_X, 1), (TIME_HIGH, 0), (ADDR_X, 2)),
-        words((TIME_HIGH, 4000), (TIME_HIGH, 1), (ADDR_X, 3)),
-    )
-    assert [row[0] for row in found] == [(4095) << 12, 4096 << 12, (2 * 4096 + 1) << 12]
-
-
 def test_a_clock_that_falls_back_is_no_new_turn() -> None:
-    decoder = Evt3Decoder()
+    decoder = Decoder(Header(3, SIZE))
     decoder.decode(words((TIME_HIGH, 1000)))
     with pytest.raises(FormatFault, match="its clock fell back"):
         decoder.decode(words((TIME_HIGH, 500)))
@@ -108,62 +87,6 @@ def by_faery(path: Path) -> list[tuple[int, int, int, int]]:
     whole = np.concatenate(list(faery.events_stream_from_file(path, file_type="evt")))
     columns = (whole[name].astype(int).tolist() for name in ("t", "x", "y", "on"))
     return list(zip(*columns, strict=True))
-
-
-def random_evt3(rng: np.random.Generator, count: int) -> bytes:
-    """Words of all types in any order, in the sensor, with a time that does not fall back.
-
-    Decoders differ where a vector follows a single event with no base of its own, which cameras do
-    not send: the maker's, and the one here, take the base from before the single event.
-    """
-    found: list[tuple[int, int]] = [(TIME_HIGH, 0), (TIME_LOW, 0), (ADDR_Y, 0), (BASE_X, 0)]
-    high, low = 0, 0
-    for _ in range(count):
-        kind = int(rng.choice([ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH]))
-        if kind == ADDR_Y:
-            value = int(rng.integers(0, SIZE[1]))
-        elif kind in {ADDR_X, BASE_X}:
-            value = int(rng.integers(0, 2)) << 11 | int(rng.integers(0, 200))
-        elif kind == TIME_LOW:
-            value = low = min(low + int(rng.integers(0, 40)), 4095)
-        elif kind == TIME_HIGH:
-            high, low = high + 1, 0
-            found.append((TIME_HIGH, high))
-            kind, value = TIME_LOW, 0  # decoders differ in the low part before it is sent
-        else:
-            value = int(rng.integers(0, 1 << (12 if kind == VECT_12 else 8)))
-        found.append((kind, value))
-        if kind == ADDR_X or (kind in {VECT_12, VECT_8} and rng.random() < 0.2):
-            found.append((BASE_X, int(rng.integers(0, 200))))
-    return words(*found)
-
-
-def test_vectors_are_read_as_another_library_reads_them(tmp_path: Path) -> None:
-    data = random_evt3(np.random.default_rng(5), 3000)
-    (path := tmp_path / "a.raw").write_bytes(Header(3, SIZE, "1").text() + data)
-    found = rows(Evt3Decoder(), data)
-    assert len(found) > 3000
-    # columns beyond the sensor, which this library refuses, do not come up
-    assert max(row[1] for row in found) < SIZE[0]
-    assert found == by_faery(path)
-
-
-def test_evt2_is_read_as_another_library_reads_it(tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    high, found = 0, [TIME_HIGH << 28]
-    low = 0
-    for _ in range(2000):
-        step = int(rng.integers(0, 8))
-        if low + step > 63:
-            high, low = high + 1, 0
-            found.append(TIME_HIGH << 28 | high)
-        else:
-            low += step
-        x, y = int(rng.integers(0, SIZE[0])), int(rng.integers(0, SIZE[1]))
-        found.append(int(rng.integers(0, 2)) << 28 | low << 22 | x << 11 | y)
-    data = np.array(found, "<u4").tobytes()
-    (path := tmp_path / "a.raw").write_bytes(Header(2, SIZE, "1").text() + data)
-    assert rows(Evt2Decoder(), data) == by_faery(path)
 
 
 def random_events(rng: np.random.Generator, count: int, first_us: int) -> EventChunk:
@@ -189,7 +112,7 @@ def test_what_is_encoded_is_read_by_another_library(tmp_path: Path) -> None:
 
 def test_what_is_encoded_is_decoded_in_any_parts_and_over_turns_of_the_clock() -> None:
     rng = np.random.default_rng(8)
-    encoder, decoder = Evt3Encoder(), Evt3Decoder()
+    encoder, decoder = Evt3Encoder(), Decoder(Header(3, SIZE))
     first_us, turns, sent, came = 12 * 3_600_000_000, [], [], []
     for _ in range(20):
         events = random_events(rng, 700, first_us)
@@ -246,5 +169,5 @@ def test_other_headers_are_refused(text: bytes, said: str) -> None:
 def test_no_words_are_nothing() -> None:
     none: Any = np.empty(0, np.int64)
     assert Evt3Encoder().encode(EventChunk.empty(), none) == b""
-    assert len(Evt3Decoder().decode(b"").events) == 0
-    assert len(Evt2Decoder().decode(b"\x00\x00").events) == 0
+    assert len(Decoder(Header(3, SIZE)).decode(b"").events) == 0
+    assert len(Decoder(Header(2, SIZE)).decode(b"\x00\x00").events) == 0

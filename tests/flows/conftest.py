@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.command_line import answer
 from tests.conftest import ROOT, SMALL
 
 # Prefect reads these when it is imported, which happens when a test module imports a flow
@@ -26,13 +27,21 @@ os.environ["PREFECT_HOME"] = _HOME
 
 from sliplab.analysis.report.sources import report_folder  # noqa: E402
 from sliplab.flows.collect import collect  # noqa: E402
-from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
-from sliplab.flows.running import orchestration, parallel_map, run_records  # noqa: E402
+from sliplab.flows.collecting.session import TrialCollector  # noqa: E402
+from sliplab.flows.planning.campaign_trials import pending_trials  # noqa: E402
+from sliplab.flows.planning.run_request import (  # noqa: E402
+    RunRequest,
+    describe_campaign,
+    make_request,
+)
+from sliplab.flows.running import orchestration, parallel_map, run_records, stopping  # noqa: E402
 from sliplab.flows.running.embedded_server import ServerError  # noqa: E402
 from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
 from sliplab.flows.study import StudyOutcome, study  # noqa: E402
+from sliplab.rigs.build import build_rig  # noqa: E402
+from sliplab.rigs.rig_file import RigFile  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
-from sliplab.storage.trials.store import Store  # noqa: E402
+from sliplab.storage.trials.store import Campaign, Store  # noqa: E402
 
 Ran = tuple[list[RunRequest], StudyOutcome]
 """What the fixture `ran` gives: the runs of the small study, and how they ended."""
@@ -76,6 +85,22 @@ def prefect_server() -> Iterator[None]:
         patch.setattr(orchestration, "_servers", _real)
         patch.setattr(orchestration, "_lost_servers", set())
         yield
+
+
+@pytest.fixture(autouse=True)
+def forget() -> Iterator[None]:
+    """No stop request outlives its test."""
+    yield
+    with stopping.signals():
+        pass
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A detector's calibration for the skin of the rig `rehearsal`."""
+    out = tmp_path_factory.mktemp("skin") / "skin.json"
+    answer("calibrate", "detector", "--rig", "rehearsal", "--out", out, "--hold", 5, "--yes")
+    return out
 
 
 def tiny() -> dict[str, Any]:
@@ -135,6 +160,25 @@ def write(path: Path, data: dict[str, Any]) -> Path:
     """`data` as a YAML file."""
     path.write_text(yaml.dump(data, Dumper=yaml.CSafeDumper))
     return path
+
+
+def requested(folder: Path) -> RunRequest:
+    """Request a run of the folder's protocol on its rig, into its store."""
+    return make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+
+
+def at_rig(run_request: RunRequest, file: RigFile | None = None) -> tuple[TrialCollector, Campaign]:
+    """A connected session on the request's rig, or on that of another file."""
+    campaign = describe_campaign(Store.create(run_request.store), run_request)
+    file = file or run_request.rig
+    rig = build_rig(file)
+    rig.connect()
+    return TrialCollector(run_request.plan, file, rig, campaign), campaign
+
+
+def take_all(work: TrialCollector) -> None:
+    """Take what is pending."""
+    work.take(pending_trials(work.plan, work.campaign))
 
 
 def run_small_study(folder: Path, rig_path: Path) -> tuple[list[RunRequest], StudyOutcome]:

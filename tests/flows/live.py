@@ -12,15 +12,15 @@ from typing import Any
 import yaml
 
 from sliplab.flows.collecting.session import TrialCollector
-from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.plugins.loopback.client import Loopback
 from sliplab.plugins.loopback.rig import loopback_rig
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT, SMALL
-from tests.flows.conftest import write
+from tests.flows.conftest import at_rig, take_all, write
 from tests.rigs.waiting import own_address
 
 
@@ -52,7 +52,7 @@ def quick(
     return data
 
 
-def rig_yaml(folder: Path) -> Path:
+def rig_yaml(folder: Path, **changes: Any) -> Path:
     """The shipped loopback rig with a fake arm at an address of its own, near the plate."""
     data = {
         "extends": str(ROOT / "rigs" / "loopback.yaml"),
@@ -60,6 +60,8 @@ def rig_yaml(folder: Path) -> Path:
         "devices": {"arm": {"host": own_address()}},
         "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}},
     }
+    if changes:
+        data = {"extends": str(write(folder / "base.yaml", data)), "name": "loopback", **changes}
     return write(folder / "rig.yaml", data)
 
 
@@ -94,9 +96,12 @@ def at_work(
         rig.close()
 
 
-def take_all(work: TrialCollector) -> None:
-    """Take what is pending."""
-    work.take(pending_trials(work.plan, work.campaign))
+def only_trial(run_request: RunRequest, file: RigFile | None = None) -> Recording:
+    """The only trial of a request, taken on its simulated rig."""
+    work, campaign = at_rig(run_request, file)
+    take_all(work)
+    (recording,) = campaign.recordings()
+    return recording
 
 
 def free_udp_port() -> int:

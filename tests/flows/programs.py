@@ -33,13 +33,13 @@ def ended(
 
 @contextmanager
 def running(
-    command: Sequence[object], log: Path, env: dict[str, str] | None = None
+    command: Sequence[object], log: Path, env: dict[str, str] | None = None, cwd: Path = ROOT
 ) -> Iterator[subprocess.Popen[str]]:
     """Run a program in a session of its own; nothing of it is left when the block ends."""
     with log.open("w") as messages:
         process = subprocess.Popen(
             [*map(str, command)],
-            cwd=ROOT,
+            cwd=cwd,
             env=environment() if env is None else env,
             text=True,
             start_new_session=True,

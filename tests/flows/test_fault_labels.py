@@ -11,8 +11,8 @@ from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import OnsetDoubts
 from sliplab.storage.trials.recording import Recording
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import tiny, tiny_gravity
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import take_all, tiny, tiny_gravity
 
 TRACKS = {"level": "tracks"}
 

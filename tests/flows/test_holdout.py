@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -24,20 +23,17 @@ from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
-from tests.flows.conftest import Ran, shape_of, summary_json
+from tests.flows.conftest import shape_of, summary_json
 
 SEEDS = (5, 6)
 """Not the release's: no test may look at its trials."""
 
 
 @pytest.fixture(scope="module")
-def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(own_study: Store) -> Store:
     """A copy of the small study, with four trials held out."""
-    folder = tmp_path_factory.mktemp("holdout") / "store"
-    shutil.copytree(ran[0][0].store, folder)
-    found = Store.open(folder)
-    assert measure_holdout(found, collected(found), 4, seeds=SEEDS).done == 1
-    return found
+    assert measure_holdout(own_study, collected(own_study), 4, seeds=SEEDS)["done"] == 1
+    return own_study
 
 
 def test_the_release_s_seeds_stand_nowhere_else() -> None:
@@ -78,25 +74,25 @@ def test_it_is_judged_once_a_version_and_written_down(
 ) -> None:
     campaigns = collected(store)
     first = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert first.done == 0
-    (line,) = first.result.evaluations
+    assert first["done"] == 0
+    (line,) = first["result"].evaluations
     key = evaluation_of(store).key
     assert key is not None
-    assert line.model == first.result.model
-    assert line.strict == first.result.windows.accuracy.strict
+    assert line.model == first["result"].model
+    assert line.strict == first["result"].windows.accuracy.strict
     # other settings under the same version: kept as it was, and said
     monkeypatch.setattr(figures, "VERSION", 99)
     again = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert (again.done, again.result) == (0, first.result)
+    assert (again["done"], again["result"]) == (0, first["result"])
     assert "a second look" in capsys.readouterr().err
     # a new version of the program looks once more
     for module in (holdout, figures):
         monkeypatch.setattr(module, "version", lambda name: "99.0")
     later = measure_holdout(store, campaigns, 4, seeds=SEEDS)
-    assert [each.version for each in later.result.evaluations] == [line.version, "99.0"]
+    assert [each.version for each in later["result"].evaluations] == [line.version, "99.0"]
     asked = measure_holdout(store, campaigns, 3, again=True, seeds=SEEDS)
-    assert len(asked.result.evaluations) == 3
-    kept, now = first.result.to_json(), later.result.to_json()
+    assert len(asked["result"].evaluations) == 3
+    kept, now = first["result"].to_json(), later["result"].to_json()
     assert all(now[name] == kept[name] for name in ("windows", "rows", "kinematic", "trials"))
     write_json(store.folder / "holdout/results.json", kept)
 

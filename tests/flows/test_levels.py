@@ -10,16 +10,13 @@ import pytest
 import yaml
 
 from sliplab.analysis.labels.labelling import Label, label_recording
-from sliplab.flows.collecting.session import TrialCollector
-from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.planning.run_request import describe_campaign, make_request
-from sliplab.rigs.build import build_rig
+from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.trials.checksums import write_sums
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
-from tests.flows.conftest import tiny, tiny_gravity, write
+from tests.flows.conftest import at_rig, take_all, tiny, tiny_gravity, write
 
 FRAME_MS = 10.0
 
@@ -49,14 +46,12 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
     base = str(ROOT / "rigs" / "mock.yaml")
     rig_path.write_text(yaml.safe_dump({"extends": base, "mock": {"frame_camera": camera}}))
     run_request = make_request(write(folder / "p.yaml", data), rig_path, folder / "store")
-    campaign = describe_campaign(Store.create(folder / "store"), run_request)
-    rig = build_rig(run_request.rig)
-    rig.connect()
-    (trial,) = pending_trials(run_request.plan, campaign)
-    TrialCollector(run_request.plan, run_request.rig, rig, campaign).take([trial])
+    work, campaign = at_rig(run_request)
+    take_all(work)
     assert verify(Store.open(folder / "store")) == []
     with_plate = run_request.plan.protocol.collection.plate is not None
-    return campaign.recording(trial.id), run_request.rig.frame_bytes(with_plate)
+    (recording,) = campaign.recordings()
+    return recording, run_request.rig.frame_bytes(with_plate)
 
 
 def label(recording: Recording, data: dict[str, Any]) -> Label:

@@ -32,15 +32,12 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
-from tests.flows.conftest import Ran, summary_json
+from tests.flows.conftest import summary_json
 
 
-@pytest.fixture(scope="module")
-def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """A copy of the small study."""
-    folder = tmp_path_factory.mktemp("others") / "store"
-    shutil.copytree(ran[0][0].store, folder)
-    return Store.open(folder)
+@pytest.fixture
+def store(own_study: Store) -> Store:
+    return own_study
 
 
 def lab(folder: Path, step: float = 0.1, **changes: Any) -> Path:

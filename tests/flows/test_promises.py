@@ -19,21 +19,12 @@ from sliplab.protocols import InputError
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store
 from tests.command_line import here
-from tests.flows.calibrating.test_calibrate import run
 from tests.flows.conftest import Ran
 
 
 @pytest.fixture(scope="module")
 def store(ran: Ran) -> Store:
     return Store.open(ran[0][0].store)
-
-
-@pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("skin") / "skin.json"
-    words = ("--hold", 5, "--yes", "--json")
-    assert run("calibrate", "detector", "--rig", "rehearsal", "--out", out, *words) == 0
-    return out
 
 
 def test_evaluate_says_that_two_trials_promise_nothing(store: Store) -> None:

@@ -38,7 +38,7 @@ from sliplab.storage.trials.store import Store, StoreError
 from tests.analysis.report.test_plugin_sections import install
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
-from tests.flows.conftest import Ran, write
+from tests.flows.conftest import write
 from tests.protocols.test_plugin import installed
 
 __all__ = ["installed"]  # a fixture
@@ -52,13 +52,10 @@ UNITLESS = re.compile(
 
 
 @pytest.fixture(scope="module")
-def store(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(own_study: Store) -> Store:
     """A copy of the small study, with its report."""
-    folder = tmp_path_factory.mktemp("report") / "store"
-    shutil.copytree(ran[0][0].store, folder)
-    found = Store.open(folder)
-    report(found, collected(found))
-    return found
+    report(own_study, collected(own_study))
+    return own_study
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.protocols.labelling import Labelling
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.trials.recording import Recording
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import tiny
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import take_all, tiny
 
 DEVICES = {"events": "event_camera", "arm": "arm", "frames": "frame_camera"}
 MS = 1_000_000
@@ -100,7 +100,7 @@ def test_every_accepted_trial_agrees_with_the_truth(
         fault for fault in BAD if fault["device"] != "arm" or timing.get("arm") != "host time"
     ]
     timing = {**EXACT, **timing}
-    work, campaign = session(tmp_path, slides(), timing, clocks=DRIFTING, faults=faults)
+    work, campaign = session(tmp_path, slides(), {"timing": timing}, clocks=DRIFTING, faults=faults)
     take_all(work)
     recordings = list(campaign.recordings())
     assert len(recordings) == 3
@@ -132,7 +132,7 @@ def test_every_accepted_trial_agrees_with_the_truth(
 
 def test_every_grade_is_named_with_its_gate(tmp_path: Path) -> None:
     for number, timing in enumerate(TIMINGS.values()):
-        work, campaign = session(tmp_path / str(number), slides(), timing)
+        work, campaign = session(tmp_path / str(number), slides(), {"timing": timing})
         work.take(list(work.plan)[:1])
         limits = work.plan.protocol.collection.gates.sync_uncertainty
         (recording,) = campaign.recordings()

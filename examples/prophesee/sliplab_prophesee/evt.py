@@ -1,35 +1,28 @@
 """Prophesee's event formats: RAW headers, EVT 3.0 and EVT 2.0 to events and triggers, and back.
 
 A RAW stream is a header of lines that begin with ``%``, the last ``% end``, and little-endian
-words. The four highest bits of a word are its type. EVT 3.0 sends what has changed only: 16-bit
-words set the time (12 high bits, 12 low bits, 1 us), the row, and a column with its polarity, alone
-or as the first of a vector of 12 or 8 pixels. EVT 2.0 has the column, the row and the 6 low bits of
-the time in each word of 32 bits. Layouts: docs.prophesee.ai, Encoding Formats; times before the
-first high part are unknown, and dropped, as the maker's decoders do.
+words; `sliplab.plugins.formats.evt` says what they mean. The fake sends EVT 3.0.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.plugins.formats.evt import EDGES, EVT2, EVT3, FAULT, OUTSIDE, ROOM, new_state
+from sliplab.storage.formats.foreign import empty_events
 from sliplab.storage.streams import EventChunk
 
-U16 = npt.NDArray[np.uint16]
-U32 = npt.NDArray[np.uint32]
 I64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 MOST_HEADER = 1 << 20
-ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8 = 0x0, 0x2, 0x3, 0x4, 0x5
-TIME_LOW, TIME_HIGH, EXT_TRIGGER = 0x6, 0x8, 0xA
-_HIGHS = 1 << 12
-"""EVT 3.0: values of the high part of the time, of 4096 us each, before it begins anew."""
-_HIGHS_2 = 1 << 28
-"""The same of EVT 2.0, of 64 us each."""
+ADDR_Y, ADDR_X, TIME_LOW, TIME_HIGH, EXT_TRIGGER = 0x0, 0x2, 0x6, 0x8, 0xA
+_ENCODINGS = {2: EVT2, 3: EVT3}
+_MOST_EVENTS = 12
+"""Events of a word: of the longest vector."""
 
 
 class FormatFault(ValueError):
@@ -96,139 +89,38 @@ class Decoded:
     trigger_up: Bool
 
 
-class Decoder(Protocol):
-    """A decoder of one stream, which keeps its state from call to call."""
+class Decoder:
+    """A decoder of one stream, which keeps its state from call to call.
+
+    It decodes as the import of RAW files does; an event outside of the camera is left out.
+    """
+
+    def __init__(self, header: Header) -> None:
+        self._encoding, self._size = _ENCODINGS[header.evt], header.size
+        self._dtype = np.dtype(self._encoding.dtype)
+        self._state, self._left = new_state(0), b""
+        self.decode(b"")  # the kernel is compiled before the stream flows
 
     def decode(self, data: bytes) -> Decoded:
         """Decode the next bytes; a word that is cut is kept. Raises FormatFault."""
-
-
-def decoder_of(header: Header) -> Decoder:
-    """Return a decoder of a stream with that header."""
-    return Evt3Decoder() if header.evt == 3 else Evt2Decoder()
-
-
-class _Clock:
-    """The high part of the time, counted on where it begins anew."""
-
-    def __init__(self, values: int) -> None:
-        self._values = values
-        self.total: int | None = None
-        """The last one; None before the first."""
-
-    def follow(self, high: I64) -> I64:
-        """Return values of the stream counted on, with `total` before them, (k + 1,).
-
-        Raises:
-            FormatFault: one is smaller than the one before, and not by as much as by a new turn.
-        """
-        assert self.total is not None
-        before = np.concatenate([[self.total % self._values], high])
-        step = np.diff(before)
-        again = step < -self._values // 2
-        if np.any((step < 0) & ~again):
-            raise FormatFault("its clock fell back")
-        counted: I64 = self.total + np.concatenate([[0], np.cumsum(step + again * self._values)])
-        self.total = int(counted[-1])
-        return counted
-
-
-class Evt3Decoder:
-    """A decoder of EVT 3.0."""
-
-    def __init__(self) -> None:
-        self._left = b""
-        self._clock = _Clock(_HIGHS)
-        self._state = np.array([TIME_LOW << 12, ADDR_Y << 12, BASE_X << 12], np.uint16)
-        """Words that stand for what was sent before: low time, row, and base column."""
-
-    def decode(self, data: bytes) -> Decoded:
-        """Decode the next bytes. Raises FormatFault."""
         data = self._left + data
-        whole = len(data) // 2 * 2
-        words, self._left = np.frombuffer(data[:whole], "<u2"), data[whole:]
-        kind = words >> 12
-        if self._clock.total is None:
-            highs = np.flatnonzero(kind == TIME_HIGH)
-            if not len(highs):
-                return _nothing()
-            words = words[highs[0] :]
-            self._clock.total = int(words[0] & 0xFFF)
-        # the words that stand for the state come first: then every word has one before it
-        words = np.concatenate([np.array([TIME_HIGH << 12], np.uint16), self._state, words])
-        kind, value = words >> 12, (words & 0xFFF).astype(np.int64)
-        high = kind == TIME_HIGH
-        counted = self._clock.follow(value[high][1:])
-        timed = _last(high | (kind == TIME_LOW))
-        low = np.where(kind[timed] == TIME_LOW, value[timed], 0)
-        t_us = (counted[np.cumsum(high) - 1] << 12) + low
-        row = value[_last(kind == ADDR_Y)] & 0x7FF
-
-        size = 12 * (kind == VECT_12) + 8 * (kind == VECT_8)
-        passed = np.cumsum(size) - size
-        base = _last(kind == BASE_X)
-        column = (value[base] & 0x7FF) + passed - passed[base]
-        alone = kind == ADDR_X
-        column = np.where(alone, value & 0x7FF, column)
-        up = np.where(alone, value, value[base]) >> 11
-        valid = np.where(alone, 1, np.where(kind == VECT_8, value & 0xFF, value))
-        carrying = np.flatnonzero(alone | (size > 0))
-        bits = valid[carrying, None] >> np.arange(12) & 1
-        which, bit = np.nonzero(bits)
-        at = carrying[which]
-        events = EventChunk(
-            (column[at] + bit).astype(np.uint16),
-            row[at].astype(np.uint16),
-            up[at].astype(np.uint8),
-            t_us[at],
-        )
-
-        reached = int((value[base[-1]] & 0x7FF) + passed[-1] + size[-1] - passed[base[-1]])
-        polarity = int(value[base[-1]]) & 0x800
-        self._state = np.array(
-            [
-                TIME_LOW << 12 | int(low[-1]),
-                ADDR_Y << 12 | int(row[-1]),
-                BASE_X << 12 | polarity | min(reached, 0x7FF),
-            ],
-            np.uint16,
-        )
-        triggered = kind == EXT_TRIGGER
-        edge = value[triggered]
-        return Decoded(events, t_us[triggered], edge >> 8, (edge & 1).astype(bool))
-
-
-class Evt2Decoder:
-    """A decoder of EVT 2.0."""
-
-    def __init__(self) -> None:
-        self._left = b""
-        self._clock = _Clock(_HIGHS_2)
-
-    def decode(self, data: bytes) -> Decoded:
-        """Decode the next bytes. Raises FormatFault."""
-        data = self._left + data
-        whole = len(data) // 4 * 4
-        words, self._left = np.frombuffer(data[:whole], "<u4"), data[whole:]
-        if self._clock.total is None:
-            highs = np.flatnonzero(words >> 28 == TIME_HIGH)
-            if not len(highs):
-                return _nothing()
-            words = words[highs[0] :]
-            self._clock.total = int(words[0] & (_HIGHS_2 - 1))
-        kind, value = words >> 28, (words & (_HIGHS_2 - 1)).astype(np.int64)
-        high = kind == TIME_HIGH
-        counted = self._clock.follow(value[high])
-        t_us = (counted[np.cumsum(high)] << 6) + (value >> 22)
-        seen, triggered = kind < 2, kind == EXT_TRIGGER
-        place, edge = value[seen], value[triggered]
-        events = EventChunk(
-            (place >> 11 & 0x7FF).astype(np.uint16),
-            (place & 0x7FF).astype(np.uint16),
-            kind[seen].astype(np.uint8),
-            t_us[seen],
-        )
-        return Decoded(events, t_us[triggered], edge >> 8 & 0x1F, (edge & 1).astype(bool))
+        whole = len(data) - len(data) % self._dtype.itemsize
+        self._left = data[whole:]
+        words = np.frombuffer(bytearray(data[:whole]), self._dtype)
+        chunk = empty_events(_MOST_EVENTS * len(words) + ROOM)
+        edges = np.empty((len(words) + 1, 3), np.int64)
+        columns = chunk.x, chunk.y, chunk.p, chunk.t_us, edges
+        state, at, filled = self._state, 0, 0
+        state[EDGES] = state[FAULT] = 0
+        while True:
+            at, filled = self._encoding.decode(words, at, filled, state, *self._size, *columns)
+            if not state[FAULT]:
+                break
+            if state[FAULT] != OUTSIDE:
+                raise FormatFault("its clock fell back")
+            at += self._encoding.after_fault(int(words[at]), state)[0]
+        t_us, which, rising = edges[: state[EDGES]].T
+        return Decoded(chunk[:filled], t_us, which, rising == 1)
 
 
 class Evt3Encoder:
@@ -297,15 +189,3 @@ class Evt3Encoder:
         if len(rows):
             self._row = int(rows[-1])
         return words[sent].astype("<u2").tobytes()
-
-
-def _last(mask: Bool) -> I64:
-    """Return the index of the last True at or before each place; there is one."""
-    index = np.where(mask, np.arange(len(mask)), 0)
-    found: I64 = np.maximum.accumulate(index)
-    return found
-
-
-def _nothing() -> Decoded:
-    none = np.empty(0, np.int64)
-    return Decoded(EventChunk.empty(), none, none, np.empty(0, bool))

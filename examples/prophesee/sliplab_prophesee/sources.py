@@ -27,7 +27,6 @@ from sliplab_prophesee.evt import (
     Decoder,
     FormatFault,
     Header,
-    decoder_of,
 )
 
 DEVICE = "event camera"
@@ -94,7 +93,7 @@ class StreamSource:
         except BaseException:
             self._socket.close()
             raise
-        self._decoder = decoder_of(found)
+        self._decoder = Decoder(found)
         (self.width, self.height), self.serial = found.size, found.serial or UNKNOWN
         self._socket.settimeout(WAIT_S)
 
@@ -160,7 +159,7 @@ class FileSource:
     def start(self) -> None:
         """Begin anew."""
         self._file.seek(self._data_at)
-        self._decoder, self._held, self._first_us = decoder_of(self._header), None, -1
+        self._decoder, self._held, self._first_us = Decoder(self._header), None, -1
 
     def read(self) -> Decoded | None:
         """Return the next part, once it was made."""

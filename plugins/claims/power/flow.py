@@ -336,9 +336,13 @@ def drawn_campaigns(drawing: Drawing, count: int) -> list[CampaignDraw]:
         while len(found) < count and time.monotonic() - began < START_S:
             keep(len(found), drawing.campaign(len(found)))
         here = len(found)
-        jobs = range(here, count)
-        task = ("campaigns", drawing.campaign, jobs, lambda k, made: keep(here + k, made), None)
-        orchestration.run(parallel_map_flow, orchestration.Opaque(task))
+        orchestration.run(
+            parallel_map_flow,
+            "campaigns",
+            drawing.campaign,
+            range(here, count),
+            lambda k, made: keep(here + k, made),
+        )
     return [found[number] for number in range(count)]
 
 

@@ -24,8 +24,6 @@ from benchmarks.guesses.study import STUDY
 from benchmarks.scene_parameters import AS_IT_IS, ParameterSetting
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.cli.study_command import study_app
-from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.study import StudyOutcome
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -38,15 +36,10 @@ GUESS = "event_camera.contrast"
 
 
 @pytest.fixture(scope="module")
-def store(
-    ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
-) -> Store:
+def store(own_study: Store) -> Store:
     """A copy of the small study, its contrast measured down and up."""
-    folder = tmp_path_factory.mktemp("guesses") / "store"
-    shutil.copytree(ran[0][0].store, folder)
-    found = Store.open(folder)
-    measure_guesses(found, collected(found), (GUESS,), 20)
-    return found
+    measure_guesses(own_study, collected(own_study), (GUESS,), 20)
+    return own_study
 
 
 def kept(store: Store) -> dict[str, Json]:

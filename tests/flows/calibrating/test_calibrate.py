@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.calibration.charuco import Board, find_corners
-from sliplab.flows import __main__ as entry
 from sliplab.flows.calibrating import calibrate, measurement, teach
 from sliplab.flows.calibrating.calibrate import PNG_PX_PER_MM, print_board
 from sliplab.flows.running import exit_codes, stopping
@@ -261,35 +259,26 @@ def test_a_board_of_another_kind_of_file_is_refused(tmp_path: Path) -> None:
             print_board(Board(), path)
 
 
-def run(*arguments: object) -> int:
-    """The command line in this process, signals left alone."""
-    before = sys.argv
-    sys.argv = ["sliplab", *map(str, arguments)]
-    try:
-        return entry._run()
-    finally:
-        sys.argv = before
-
-
-def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_writes_and_says_what(tmp_path: Path) -> None:
     path = lab(tmp_path, moved_mm=1.0)
     before = path.read_text()
-    assert run("teach", "plane", "--rig", path, "--yes", "--json", "--repeats", 1) == 0
-    said = capsys.readouterr()
-    data = json.loads(said.out)
+    done = here("teach", "plane", "--rig", path, "--yes", "--json", "--repeats", 1)
+    assert done.returncode == 0
+    data = json.loads(done.stdout)
     assert (data["simulated"], data["written"]) == (True, str(path))
     assert Path(data["kept"]).read_text() == before
     assert data["moved_mm"] == pytest.approx(-1.0, abs=0.1)
-    assert "simulated" in said.err
-    assert "mm/s" in said.err
+    assert "simulated" in done.stderr
+    assert "mm/s" in done.stderr
     file, _ = load_rig_file(path)
     assert file.calibration.contact_plane.taught == date.today()
-    assert run("teach", "zero", "--rig", path, "--yes", "--by", "events", "--repeats", 1) == 0
-    assert "zero_mm" in capsys.readouterr().out
+    done = here("teach", "zero", "--rig", path, "--yes", "--by", "events", "--repeats", 1)
+    assert done.returncode == 0
+    assert "zero_mm" in done.stdout
     assert load_rig_file(path)[0].calibration.depth_zero is not None
     # the zero belonged to the plane that was there
-    assert run("teach", "plane", "--rig", path, "--yes", "--by", "hand", "--json") == 0
-    assert json.loads(capsys.readouterr().out)["removed"] == ["calibration.depth_zero"]
+    by_hand = answer("teach", "plane", "--rig", path, "--yes", "--by", "hand")
+    assert by_hand["removed"] == ["calibration.depth_zero"]
     assert load_rig_file(path)[0].calibration.depth_zero is None
 
 
@@ -312,7 +301,6 @@ def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFi
 )
 def test_wrong_input_is_exit_2_and_moves_nothing(
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     arguments: tuple[object, ...],
     says: str,
@@ -323,31 +311,25 @@ def test_wrong_input_is_exit_2_and_moves_nothing(
     moved: list[object] = []
     monkeypatch.setattr(teach, "touch", lambda *_: moved.append(1))
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    assert run(*(places.get(str(a), a) for a in arguments)) == exit_codes.WRONG_INPUT
-    said = capsys.readouterr()
-    assert says in " ".join(said.err.split())
-    assert said.out == ""
+    done = here(*(places.get(str(a), a) for a in arguments))
+    assert (done.returncode, done.stdout) == (exit_codes.WRONG_INPUT, "")
+    assert says in " ".join(done.stderr.split())
     assert not moved
     assert [p.name for p in tmp_path.iterdir() if p.suffix] == ["lab.yaml"]
 
 
+@pytest.mark.usefixtures("no_rig")
 @pytest.mark.parametrize("what", ["plane", "zero", "tool"])
-def test_a_dry_run_says_where_and_connects_to_nothing(
-    what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("a dry run builds no rig")
-
-    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
-    assert run("teach", what, "--rig", "mock", "--dry-run", "--json") == 0
-    data = json.loads(capsys.readouterr().out)
+def test_a_dry_run_says_where_and_connects_to_nothing(what: str) -> None:
+    data = answer("teach", what, "--rig", "mock", "--dry-run")
     assert data["dry_run"] is True
     assert len(data["moves"]) == {"plane": 4, "zero": 2, "tool": 0}[what]
     for move in data["moves"]:
         depth_mm = TRUE_PLANE.position(move["base_mm"]).depth_mm
         assert (move["to_mm"], depth_mm) == (2.0, pytest.approx(2.0, abs=0.01))
-    assert run("teach", what, "--rig", "mock", "--dry-run") == 0
-    assert "dry run" in capsys.readouterr().out
+    done = here("teach", what, "--rig", "mock", "--dry-run")
+    assert done.returncode == 0
+    assert "dry run" in done.stdout
 
 
 STOPPED = "  faults: [{kind: arm_protective_stop, trial: %d, at_s: 2, since: trial}]\n"
@@ -362,49 +344,54 @@ STOPPED = "  faults: [{kind: arm_protective_stop, trial: %d, at_s: 2, since: tri
     ids=["no plate", "protective stop"],
 )
 def test_a_failed_measurement_is_exit_1_and_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], says: str
+    tmp_path: Path, changes: dict[str, Any], says: str
 ) -> None:
     path = lab(tmp_path, **changes)
     before = path.read_text()
-    assert run("teach", "plane", "--rig", path, "--yes") == exit_codes.FAILED
-    assert says in " ".join(capsys.readouterr().err.split())
+    done = here("teach", "plane", "--rig", path, "--yes")
+    assert done.returncode == exit_codes.FAILED
+    assert says in " ".join(done.stderr.split())
     assert path.read_text() == before
     assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
 
 
-def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = lab(tmp_path)
-    before = path.read_text()
+def stopped_after(looks: int, *words: object) -> tuple[Rig, int]:
+    """Run a command with a stop after so many looks for one; return its rig, and looks left."""
     rigs: list[Rig] = []
-    asked = iter([False] * 250)
+    asked = iter([False] * looks)
 
     def built(file: Any, should_stop: Any) -> Rig:
         rigs.append(build_rig(file, should_stop))
         return rigs[-1]
 
-    monkeypatch.setattr("sliplab.rigs.build.build_rig", built)
-    monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
-    assert run("teach", "plane", "--rig", path, "--yes") == exit_codes.INTERRUPTED
-    said = capsys.readouterr().err
-    assert "the arm is at rest, nothing was written" in said
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sliplab.rigs.build.build_rig", built)
+        patch.setattr(stopping, "requested", lambda: next(asked, True))
+        done = here(*words)
+    assert done.returncode == exit_codes.INTERRUPTED
+    assert "the arm is at rest, nothing was written" in done.stderr
     (rig,) = rigs
+    return rig, len(list(asked))
+
+
+def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(tmp_path: Path) -> None:
+    path = lab(tmp_path)
+    before = path.read_text()
+    rig, _ = stopped_after(250, "teach", "plane", "--rig", path, "--yes")
     assert rig.arm.progress().done
     assert rig.position().depth_mm <= -2.9
     assert path.read_text() == before
 
 
-def test_a_person_who_says_stop_ends_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_person_who_says_stop_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stops(*_: object) -> None:
         raise StopRequested
 
     monkeypatch.setattr(teach, "jog_poses", stops)
     path = lab(tmp_path)
-    assert run("teach", "tool", "--rig", path, "--yes") == exit_codes.INTERRUPTED
-    assert "stopped" in capsys.readouterr().err
+    done = here("teach", "tool", "--rig", path, "--yes")
+    assert done.returncode == exit_codes.INTERRUPTED
+    assert "stopped" in done.stderr
 
 
 def test_the_arm_is_asked_for_before_it_moves(
@@ -422,7 +409,7 @@ def test_the_arm_is_asked_for_before_it_moves(
 
     monkeypatch.setattr("sys.stdin", Terminal())
     monkeypatch.setattr(measurement.typer, "confirm", answer)
-    assert run("teach", "zero", "--rig", lab(tmp_path)) == exit_codes.INTERRUPTED
+    assert here("teach", "zero", "--rig", lab(tmp_path)).returncode == exit_codes.INTERRUPTED
     assert "Move the arm?" in asked[0]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,22 @@ import pytest
 
 from sliplab.analysis.detectors.papillae import LEAST, VERSION
 from sliplab.analysis.detectors.skin import calibrated, load_calibration
-from sliplab.flows.running import exit_codes, stopping
+from sliplab.flows.running import exit_codes
 from sliplab.protocols import InputError
-from sliplab.rigs.build import build_rig
-from sliplab.rigs.core.rig import Rig
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.detector import DetectorCalibration
+from tests.command_line import answer, here
 from tests.docs.nonsense import check_refusals, checker
-from tests.flows.calibrating.test_calibrate import lab, run
+from tests.flows.calibrating.test_calibrate import lab, stopped_after
 
-QUICK = ("--hold", 5, "--yes", "--json")
+QUICK = ("--hold", 5, "--yes")
 
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made on the simulated rig."""
     out = tmp_path_factory.mktemp("skin") / "skin.json"
-    assert run("calibrate", "detector", "--rig", "mock", "--out", out, *QUICK) == 0
+    answer("calibrate", "detector", "--rig", "mock", "--out", out, *QUICK)
     return out
 
 
@@ -58,34 +56,26 @@ def test_the_document_has_a_schema(document: Path) -> None:
 
 
 @pytest.mark.long
-def test_it_says_what_so_much_holding_supports(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_it_says_what_so_much_holding_supports(tmp_path: Path) -> None:
     (tmp_path / "mock.detector.json").write_text("the old one")
-    assert run("calibrate", "detector", "--rig", "mock", "--hold", 5, "--yes") == 0
-    captured = capsys.readouterr()
-    said = " ".join(captured.out.split())
+    done = here("calibrate", "detector", "--rig", "mock", *QUICK, cwd=tmp_path)
+    assert done.returncode == 0
+    said = " ".join(done.stdout.split())
     assert "detector of rig mock (simulated)" in said
     assert "1 an hour takes 3.69 h (--hold)" in said
     assert load_calibration(tmp_path / "mock.detector.json").rig == "mock"
     old = tmp_path / f"mock.detector.before-{date.today().isoformat()}.json"
     assert old.read_text() == "the old one"
-    assert f"the old file is kept as {old}" in " ".join((captured.out + captured.err).split())
+    assert f"the old file is kept as {old}" in " ".join((done.stdout + done.stderr).split())
 
 
-def test_a_dry_run_lists_the_motion_and_moves_nothing(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("a dry run builds no rig")
-
-    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
-    assert run("calibrate", "detector", "--rig", "mock", "--dry-run", "--json") == 0
-    moves = json.loads(capsys.readouterr().out)["moves"]
+@pytest.mark.usefixtures("no_rig")
+def test_a_dry_run_lists_the_motion_and_moves_nothing() -> None:
+    moves = answer("calibrate", "detector", "--rig", "mock", "--dry-run")["moves"]
     assert [move["what"] for move in moves] == ["press", "unload", "rub 1", "rub 2", "rub 3"]
 
 
+@pytest.mark.usefixtures("no_rig")
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -93,57 +83,32 @@ def test_a_dry_run_lists_the_motion_and_moves_nothing(
         (("--rub", 16), "limits.reach = 15"),
         (("--out", "skin.yaml"), "must end in .json"),
         (("--out", "nowhere/skin.json"), "its folder does not exist"),
-        (("--rig", "mock_frames"), "has no event camera"),
+        (("--rig", "mock_frames"), "needs an event camera, and the rig mock-frames has none"),
     ],
 )
-def test_wrong_input_moves_nothing(
-    arguments: tuple[object, ...],
-    says: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("wrong input builds no rig")
-
-    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
-    assert run("calibrate", "detector", "--rig", "mock", *arguments, *QUICK) == (
-        exit_codes.WRONG_INPUT
-    )
-    assert says.split()[-1] in " ".join(capsys.readouterr().err.split())
+def test_wrong_input_moves_nothing(arguments: tuple[object, ...], says: str) -> None:
+    done = here("calibrate", "detector", "--rig", "mock", *arguments, *QUICK)
+    assert done.returncode == exit_codes.WRONG_INPUT
+    assert says in " ".join(done.stderr.split())
 
 
-def test_a_stop_leaves_the_arm_at_rest_and_clear(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rigs: list[Rig] = []
-    asked = iter([False] * 400)
-
-    def built(file: Any, should_stop: Any) -> Rig:
-        rigs.append(build_rig(file, should_stop))
-        return rigs[-1]
-
-    monkeypatch.setattr("sliplab.rigs.build.build_rig", built)
-    monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
+def test_a_stop_leaves_the_arm_at_rest_and_clear(tmp_path: Path) -> None:
     out = tmp_path / "skin.json"
-    found = run("calibrate", "detector", "--rig", lab(tmp_path), "--out", out, *QUICK)
-    assert found == exit_codes.INTERRUPTED
-    assert "the arm is at rest, nothing was written" in capsys.readouterr().err
-    (rig,) = rigs
-    assert next(asked, None) is None, "it had begun to hold"
+    words = ("calibrate", "detector", "--rig", lab(tmp_path), "--out", out, *QUICK)
+    rig, left = stopped_after(400, *words)
+    assert left == 0, "it had begun to hold"
     assert rig.arm.progress().done
     assert rig.position().depth_mm <= -4.9
     assert not out.exists()
 
 
 @pytest.mark.long
-def test_a_skin_that_was_not_seen_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_skin_that_was_not_seen_writes_nothing(tmp_path: Path) -> None:
     out = tmp_path / "skin.json"
     shallow = ("--depth", 0.2, "--rub", 0.5)
-    found = run("calibrate", "detector", "--rig", "mock", "--out", out, *shallow, *QUICK)
-    assert found == exit_codes.FAILED
-    assert "nothing was written" in capsys.readouterr().err
+    done = here("calibrate", "detector", "--rig", "mock", "--out", out, *shallow, *QUICK)
+    assert done.returncode == exit_codes.FAILED
+    assert "nothing was written" in done.stderr
     assert not out.exists()
 
 
@@ -192,7 +157,7 @@ def test_a_promise_that_the_hold_does_not_show_is_refused(
 @pytest.mark.realtime
 def test_it_runs_on_the_real_drivers(tmp_path: Path) -> None:
     out = tmp_path / "skin.json"
-    assert run("calibrate", "detector", "--rig", "loopback", "--out", out, *QUICK) == 0
+    answer("calibrate", "detector", "--rig", "loopback", "--out", out, *QUICK)
     found = load_calibration(out)
     assert found.simulated
     assert any(rub.alarm_ms is not None for rub in found.rubs)

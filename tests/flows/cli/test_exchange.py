@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import random
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.__main__ import _run
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.store import Store, StoreError
+from tests.command_line import here, outcome
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.formats.files import lab_hdf5
@@ -26,129 +23,112 @@ from tests.storage.formats.recordings import FILES, HEADERS, write_aedat4
 from tests.storage.trial_files import campaign, commit
 
 
-@pytest.fixture
-def sliplab(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Run a command in this process: its exit code, what it printed, what it said."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["sliplab", *map(str, arguments)])
-        code = _run()
-        reported = capsys.readouterr()
-        return code, reported.out, reported.err
-
-    return run
-
-
-def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
+def test_in_and_out(tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     store, out = tmp_path / "store", tmp_path / "out"
     path = tmp_path / "slide.h5"
-    code, reported, _ = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    code, reported, _ = outcome("import", path, "--store", store, "--name", "a", "--json")
     assert code == 0
-    assert json.loads(reported) == {
+    assert reported == {
         "campaign": "a",
         "imported": ["slide"],
         "there": [],
         "events": 50,
         "frames": 0,
     }
-    code, reported, said = sliplab("verify", store, "--json")
-    assert (code, json.loads(reported)["whole"]) == (0, 1)
-    code, reported, said = sliplab("trials", store, "--output", tmp_path / "t.parquet")
+    code, reported, said = outcome("verify", store, "--json")
+    assert (code, reported["whole"]) == (0, 1)
+    code, reported, said = outcome("trials", store, "--output", tmp_path / "t.parquet")
     assert code == 0
     assert "left out" not in said
     assert pd.read_parquet(tmp_path / "t.parquet")["trial"].tolist() == ["slide"]
-    code, reported, _ = sliplab(
+    code, reported, _ = outcome(
         "export", store, "slide", "--as", "aedat4", "--output", out, "--json"
     )
-    assert (code, json.loads(reported)["events"]) == (0, 50)
-    code, reported, _ = sliplab("import", "aedat4", out, "--store", store, "--name", "b", "--json")
-    assert (code, json.loads(reported)["imported"]) == (0, ["slide"])
+    assert (code, reported["events"]) == (0, 50)
+    code, reported, _ = outcome("import", "aedat4", out, "--store", store, "--name", "b", "--json")
+    assert (code, reported["imported"]) == (0, ["slide"])
     assert not Store.open(store).simulated
-    code, _, said = sliplab("export", store, "a", "--as", "labels", "--output", tmp_path / "l.csv")
+    code, _, said = outcome("export", store, "a", "--as", "labels", "--output", tmp_path / "l.csv")
     assert code == 1
     assert "a has no labels" in said
 
 
-def test_a_command_that_needs_a_protocol_says_that_there_is_none(
-    tmp_path: Path, sliplab: Any
-) -> None:
+def test_a_command_that_needs_a_protocol_says_that_there_is_none(tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     store = tmp_path / "store"
-    sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "a")
-    code, _, said = sliplab("review", store)
+    outcome("import", tmp_path / "slide.h5", "--store", store, "--name", "a")
+    code, _, said = outcome("review", store)
     assert code == 2
     expected = "CAMPAIGN = a: was imported without an adapter: it has neither labels nor a split"
     assert expected in " ".join(said.split())
 
 
-def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
+def test_a_gap_of_years_is_said(tmp_path: Path) -> None:
     column = np.arange(200, dtype=np.uint16)
     times = np.concatenate([[0], 1_795_000_000_000_000 + np.arange(199)]).astype(np.int64)
     path = tmp_path / "a.aedat4"
     with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (346, 260), "DAVIS346")}) as file:
         file.events(0, EventChunk(column, column, column.astype(np.uint8) % 2, times))
     store = tmp_path / "store"
-    code, reported, said = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    code, reported, said = outcome("import", path, "--store", store, "--name", "a", "--json")
     assert code == 0
-    assert len(json.loads(reported)["warnings"]) == 1
+    assert len(reported["warnings"]) == 1
     assert "warning: a.aedat4: 498,611.1 hours without an event between 0 and" in " ".join(
         said.split()
     )
-    code, *_ = sliplab("verify", store)
+    code, *_ = outcome("verify", store)
     assert code == 0
 
 
-def test_a_damaged_recording_is_exit_1_and_salvaged_when_asked(
-    tmp_path: Path, sliplab: Any
-) -> None:
+def test_a_damaged_recording_is_exit_1_and_salvaged_when_asked(tmp_path: Path) -> None:
     path, store = tmp_path / "a.aedat4", tmp_path / "store"
     write_aedat4(path)
     path.write_bytes(path.read_bytes()[:-5000])
     command = ("import", path, "--store", store, "--name", "a", "--json")
-    code, reported, said = sliplab(*command)
+    code, reported, said = outcome(*command)
     assert code == 1
-    error = json.loads(reported)["error"]
+    error = reported["error"]
     assert (error["file"], error["exit_code"]) == (str(path), 1)
     assert "is cut short" in error["message"]
     assert "--salvage imports 2,300 events up to 68" in error["message"]
     assert not list(store.glob("campaigns/*"))
-    code, reported, said = sliplab(*command, "--salvage")
+    code, reported, said = outcome(*command, "--salvage")
     assert code == 0
-    result = json.loads(reported)
+    result = reported
     (lost,) = result["salvaged"]
     assert (result["events"], lost["trial"]) == (2300, "a")
     assert 0 < lost["unread_bytes"] < 2000
     assert lost["at_byte"] + lost["unread_bytes"] == path.stat().st_size
     assert "warning: a.aedat4: is not whole" in " ".join(said.split())
-    code, reported, said = sliplab("trials", store, "--output", tmp_path / "trials.csv")
+    code, reported, said = outcome("trials", store, "--output", tmp_path / "trials.csv")
     assert pd.read_csv(tmp_path / "trials.csv")["unread_bytes"].tolist() == [lost["unread_bytes"]]
-    code, reported, said = sliplab("verify", store, "--json")
-    assert (code, json.loads(reported)["salvaged"]) == (0, ["a/a"])
+    code, reported, said = outcome("verify", store, "--json")
+    assert (code, reported["salvaged"]) == (0, ["a/a"])
     assert "a/a: was salvaged from a damaged file" in " ".join(said.split())
 
 
-def test_a_file_damaged_before_its_first_packet_is_exit_1(tmp_path: Path, sliplab: Any) -> None:
+def test_a_file_damaged_before_its_first_packet_is_exit_1(tmp_path: Path) -> None:
     path = tmp_path / "a.aedat4"
     write_aedat4(path)
     whole = path.read_bytes()
     for length in (0, 5, 20, HEADERS["aedat4"] - 1, HEADERS["aedat4"] + 20):
         path.write_bytes(whole[:length])
         for options in ((), ("--salvage",)):
-            code, *_ = sliplab("import", path, "--store", tmp_path / "s", "--name", "a", *options)
+            code, *_ = outcome("import", path, "--store", tmp_path / "s", "--name", "a", *options)
             assert code == 1
     assert not list(tmp_path.glob("s/campaigns/*"))
 
 
-def test_what_is_skipped_in_a_folder_is_listed(tmp_path: Path, sliplab: Any) -> None:
+def test_what_is_skipped_in_a_folder_is_listed(tmp_path: Path) -> None:
     folder = tmp_path / "theirs"
     folder.mkdir()
     write_aedat4(folder / "a.aedat4")
     lab_hdf5(folder / "b.h5")
     (folder / "notes.txt").write_text("a note")
     command = ("import", folder, "--store", tmp_path / "store", "--name", "a", "--json")
-    code, reported, said = sliplab(*command)
-    result = json.loads(reported)
+    code, reported, said = outcome(*command)
+    result = reported
     assert (code, result["imported"]) == (0, ["a", "b"])
     assert [item["file"] for item in result["skipped"]] == ["notes.txt"]
     assert "skipped: notes.txt: is of no known format" in " ".join(said.split())
@@ -179,7 +159,7 @@ def _mutated(head: bytes, rng: random.Random) -> bytes:
 @pytest.mark.parametrize("count", [5, pytest.param(100, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", FILES)
 def test_mutated_headers_give_one_message_and_leave_nothing(
-    tmp_path: Path, sliplab: Any, name: str, count: int
+    tmp_path: Path, name: str, count: int
 ) -> None:
     file, write = FILES[name]
     path = tmp_path / file
@@ -192,7 +172,7 @@ def test_mutated_headers_give_one_message_and_leave_nothing(
         path.write_bytes(_mutated(whole[:size], rng) + whole[size:])
         store = tmp_path / str(number)
         options = ("--salvage",) if rng.random() < 0.3 else ()
-        code, _, said = sliplab("import", path, "--store", store, "--name", "a", *options)
+        code, _, said = outcome("import", path, "--store", store, "--name", "a", *options)
         assert code in {0, 1, 2}, said
         assert "Traceback" not in said
         if code:
@@ -221,23 +201,20 @@ def test_wrong_input_is_exit_2(
     arguments: tuple[str, ...],
     says: str,
     tmp_path: Path,
-    sliplab: Any,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     for name in ("bad.aedat4", "bad.h5"):
         (tmp_path / name).write_text("hello")
     campaign(tmp_path / "ours")
-    code, reported, said = sliplab(*arguments)
-    assert (code, reported) == (2, "")
-    assert says in said
+    done = here(*arguments, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert says in done.stderr
     assert not list(tmp_path.glob("s/campaigns/*"))
 
 
-def test_an_imported_campaign_has_no_protocol(tmp_path: Path, sliplab: Any) -> None:
+def test_an_imported_campaign_has_no_protocol(tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     store = tmp_path / "store"
-    assert sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
+    assert outcome("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
     with pytest.raises(StoreError, match="is an imported campaign"):
         make_request(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
     with pytest.raises(StoreError, match="imported without an adapter"):

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from sliplab.flows import __main__ as program
 from sliplab.flows.cli.store import FOLLOW_S
 from sliplab.flows.running import stopping
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.command_line import outcome
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
 
@@ -32,31 +30,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Sliplab:
-    """The command line in this process."""
-
-    def __init__(self, patch: pytest.MonkeyPatch, capture: pytest.CaptureFixture[str]) -> None:
-        self._patch, self._capture = patch, capture
-
-    def __call__(self, *arguments: object) -> tuple[int, Any, str]:
-        """Exit code, the JSON object, and what went to standard error."""
-        words = ["sliplab", *map(str, arguments), "--json"]
-        self._patch.setattr(sys, "argv", words)
-        code = program._run()
-        reported = self._capture.readouterr()
-        return code, json.loads(reported.out) if reported.out else None, reported.err
+def sliplab(*arguments: object) -> tuple[int, Any, str]:
+    """Exit code, the JSON object, and what went to standard error."""
+    return outcome(*arguments, "--json")
 
 
-@pytest.fixture
-def sliplab(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Sliplab:
-    """The command line, with a cache of its own."""
+@pytest.fixture(autouse=True)
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each test has a cache of its own."""
     monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
-    return Sliplab(monkeypatch, capsys)
 
 
-def test_there_and_back(sliplab: Sliplab, made: Path, tmp_path: Path) -> None:
+def test_there_and_back(made: Path, tmp_path: Path) -> None:
     url = f"file://{tmp_path}/shared"
     code, sent, _ = sliplab("push", made, url)
     assert code == 0
@@ -71,7 +56,7 @@ def test_there_and_back(sliplab: Sliplab, made: Path, tmp_path: Path) -> None:
     assert (code, seen["trials"], seen["whole"], seen["ok"]) == (0, 2, 2, True)
 
 
-def test_a_url_stands_where_a_store_does(sliplab: Sliplab, made: Path, tmp_path: Path) -> None:
+def test_a_url_stands_where_a_store_does(made: Path, tmp_path: Path) -> None:
     url = f"file://{tmp_path}/shared"
     sliplab("push", made, url)
     here, there = (sliplab("trials", place)[1] for place in (made, url))
@@ -83,7 +68,7 @@ def test_a_url_stands_where_a_store_does(sliplab: Sliplab, made: Path, tmp_path:
     assert "\n" not in reported.strip()
 
 
-def test_problems_are_told_and_exit_with_1(sliplab: Sliplab, made: Path, tmp_path: Path) -> None:
+def test_problems_are_told_and_exit_with_1(made: Path, tmp_path: Path) -> None:
     url, store = f"file://{tmp_path}/shared", Path(shutil.copytree(made, tmp_path / "s"))
     record = store / "campaigns/c/trials" / TRIALS[0] / "record.json"
     record.write_bytes(record.read_bytes().replace(b"left", b"rite"))
@@ -109,7 +94,7 @@ def test_problems_are_told_and_exit_with_1(sliplab: Sliplab, made: Path, tmp_pat
 
 
 def test_follow_ends_with_the_collection(
-    sliplab: Sliplab, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = Path(shutil.copytree(made, tmp_path / "s"))
     holding = exclusive(store / STORE_LOCK, "it", about={"collects": "c"})

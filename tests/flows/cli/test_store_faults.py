@@ -2,40 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import FORMAT, Store, StoreError
+from tests.command_line import outcome
 from tests.flows.collecting.test_faults import TRACKS, slides
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import write
-
-Sliplab = Callable[..., tuple[int, dict[str, Any] | None, str]]
-
-
-@pytest.fixture
-def sliplab(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Sliplab:
-    """Run a command: its exit code, the JSON on its output, and what it said besides."""
-
-    def run(*arguments: object) -> tuple[int, dict[str, Any] | None, str]:
-        monkeypatch.setattr("sys.argv", ["sliplab", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, said = capfd.readouterr()
-        return int(str(ended.value.code)), json.loads(out) if out else None, said
-
-    return run
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import requested, take_all, write
 
 
 @pytest.fixture(scope="module")
@@ -63,41 +44,41 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_figures_add_up_after_damage(whole: Path, sliplab: Sliplab) -> None:
+def test_figures_add_up_after_damage(whole: Path) -> None:
     (trials(whole)[0] / "data.h5").write_bytes(b"x")
-    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = requested(whole)
     campaign = Store.open(whole / "store").campaign("tiny")
     counts = run_request.counts(campaign)
     assert (counts["planned"], counts["committed"], counts["missing"]) == (2, 1, 1)
     assert [trial.id for trial in pending_trials(run_request.plan, campaign)] == [
         trials(whole)[0].name
     ]
-    code, found, _ = sliplab("verify", whole / "store", "--json")
+    code, found, _ = outcome("verify", whole / "store", "--json")
     assert code == 1
     assert (found["trials"], found["whole"], found["damaged"]) == (2, 1, 1)
     assert (found["format"], found["ok"], found["quarantined"]) == (FORMAT, False, [])
     assert [item["trial"] for item in found["problems"]] == [trials(whole)[0].name]
-    code, table, said = sliplab("trials", whole / "store", "--json")
+    code, table, said = outcome("trials", whole / "store", "--json")
     assert (code, table["count"], len(table["unreadable"])) == (0, 1, 1)
     assert "left out: " in said
 
 
-def test_a_damaged_trial_is_set_aside_and_taken_again(whole: Path, sliplab: Sliplab) -> None:
+def test_a_damaged_trial_is_set_aside_and_taken_again(whole: Path) -> None:
     sums = {path.name: read_json(path / "checksums.json") for path in trials(whole)}
     flip(trials(whole)[0] / "data.h5")
-    code, found, _ = sliplab("verify", whole / "store", "--quarantine", "--json")
+    code, found, _ = outcome("verify", whole / "store", "--quarantine", "--json")
     assert (code, found["quarantined"]) == (1, [min(sums)])
     work, campaign = session(whole, slides(2), frame_camera=TRACKS)
     take_all(work)
     assert {path.name: read_json(path / "checksums.json") for path in trials(whole)} == sums
     assert campaign.quarantined()[0]["cause"].startswith("damaged: data.h5: does not match")
-    code, found, _ = sliplab("verify", whole / "store", "--json")
+    code, found, _ = outcome("verify", whole / "store", "--json")
     assert (code, found["whole"], found["damaged"], found["ok"]) == (0, 2, 0, True)
 
 
-def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path, sliplab: Sliplab) -> None:
+def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path) -> None:
     flip(trials(whole)[0] / "data.h5")
-    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = requested(whole)
     with exclusive(whole / "store" / ".lock", "the store"):
         with (
             pytest.raises(Locked, match=r"in use by another program .*pid"),
@@ -105,34 +86,32 @@ def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path, sliplab: 
         ):
             raise AssertionError("two writers")
         for command in (["verify", "--quarantine"], ["migrate"]):
-            code, _, said = sliplab(command[0], whole / "store", *command[1:])
+            code, _, said = outcome(command[0], whole / "store", *command[1:])
             assert code == 1
             assert "is in use by another program" in " ".join(said.split())
-        code, found, _ = sliplab("verify", whole / "store", "--json")  # readers need no lock
+        code, found, _ = outcome("verify", whole / "store", "--json")  # readers need no lock
         assert (code, found["damaged"]) == (1, 1)
     assert len(trials(whole)) == 2
 
 
-def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(
-    whole: Path, sliplab: Sliplab
-) -> None:
+def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(whole: Path) -> None:
     for by_hand in (True, False):
         write_json(whole / "store" / "store.json", {"format": 1})
         if by_hand:
-            code, found, _ = sliplab("migrate", whole / "store", "--json")
+            code, found, _ = outcome("migrate", whole / "store", "--json")
             assert (code, found["format"], found["from"]) == (0, FORMAT, [1])
             assert Path(found["copies"][0], "store.json").is_file()
         else:
-            with open_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
+            with open_session(requested(whole)):
                 assert Store.open(whole / "store").format == FORMAT
-    code, found, _ = sliplab("migrate", whole / "store", "--json")
+    code, found, _ = outcome("migrate", whole / "store", "--json")
     assert (code, found["from"]) == (0, [])
 
 
-def test_a_newer_store_is_refused(whole: Path, sliplab: Sliplab) -> None:
+def test_a_newer_store_is_refused(whole: Path) -> None:
     write_json(whole / "store" / "store.json", {"format": FORMAT + 1})
     for command in ("verify", "trials", "migrate"):
-        code, _, said = sliplab(command, whole / "store")
+        code, _, said = outcome(command, whole / "store")
         assert code == 1
         assert "written by a newer version of SlipLab" in " ".join(said.split())
         assert "Traceback" not in said
@@ -155,4 +134,4 @@ def test_no_path_of_a_protocol_leads_out_of_the_store(whole: Path, name: str) ->
 def test_a_campaign_without_its_description_is_not_begun_anew(whole: Path) -> None:
     (whole / "store" / "campaigns" / "tiny" / "campaign.json").unlink()
     with pytest.raises(StoreError, match=r"campaign.json.*restore it from a copy"):
-        make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+        requested(whole)

@@ -13,8 +13,8 @@ from sliplab.analysis.report.outcomes import Conditions
 from sliplab.storage.trials.store import Store
 from tests.command_line import answer, here
 from tests.conftest import ROOT
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import tiny, write
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import take_all, tiny, write
 
 
 def over_skins() -> dict[str, Any]:

@@ -9,8 +9,8 @@ import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.protocols.labelling import Labelling
-from tests.flows.collecting.test_session import session, take_all
-from tests.flows.conftest import tiny
+from tests.flows.collecting.test_session import session
+from tests.flows.conftest import take_all, tiny
 
 FRAME_MS = 10.0
 LONG = ((2.4, 6.0), (1.8, 1.6))

@@ -15,7 +15,6 @@ import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.labelling import Labelling
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.faults import KINDS
@@ -25,7 +24,7 @@ from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import checksums, session, short
-from tests.flows.conftest import tiny_gravity
+from tests.flows.conftest import requested, tiny_gravity
 
 PLANNED = 30
 _GATE = re.compile(r"(?:gate: |; )(\w+)(?: =|:)")
@@ -177,8 +176,7 @@ def test_faults_once_each_in_a_campaign_as_in_the_table(tmp_path: Path, every: i
     assert len(sound.plan) == len(campaign.committed()) == planned
     assert kept.items() <= checksums(campaign).items()
     assert verify(Store.open(tmp_path / "store")) == []
-    run_request = make_request(tmp_path / "p.yaml", tmp_path / "rig.yaml", tmp_path / "store")
-    counts = run_request.counts(campaign)
+    counts = requested(tmp_path).counts(campaign)
     assert (counts["planned"], counts["missing"], counts["set_aside"]) == (planned, 0, [])
 
     falling = tiny_gravity()

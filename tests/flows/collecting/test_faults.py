@@ -20,7 +20,8 @@ from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
-from tests.flows.collecting.test_session import checksums, session, short, take_all
+from tests.flows.collecting.test_session import checksums, session, short
+from tests.flows.conftest import take_all
 
 TRACKS = {"level": "tracks"}
 

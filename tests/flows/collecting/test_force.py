@@ -20,7 +20,6 @@ from sliplab.flows.api import open_store
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
-from sliplab.flows.planning.run_request import make_request
 from sliplab.plugins.view import view
 from sliplab.protocols import InputError, Protocol, make_plan
 from sliplab.protocols.labelling import Labelling
@@ -39,8 +38,8 @@ from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_faults import slides
-from tests.flows.collecting.test_session import session, short, take_all
-from tests.flows.conftest import tiny, tiny_gravity
+from tests.flows.collecting.test_session import session, short
+from tests.flows.conftest import requested, take_all, tiny, tiny_gravity
 from tests.plugins.view.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
@@ -51,7 +50,9 @@ def felt(
     folder: Path, data: dict[str, Any], force: dict[str, Any] | None = None, **mock: Any
 ) -> tuple[TrialCollector, Campaign]:
     """A session on a rig with a force sensor."""
-    return session(folder / "a", data, TIMING, force=force or {}, frame_camera=TRACKS, **mock)
+    return session(
+        folder / "a", data, {"timing": TIMING}, force=force or {}, frame_camera=TRACKS, **mock
+    )
 
 
 def gated(**gates: Any) -> dict[str, Any]:
@@ -154,8 +155,7 @@ def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path:
     data["collection"]["references"] = {"every": 1, "condition": condition}
     data["collection"]["gates"]["reference"] = {"event_rate": "90 %", "friction": "10 %"}
     work, campaign = felt(tmp_path, data, faults=[{"kind": "skin_wear", "per_m": per_m}])
-    protocol, rig, folder = (tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store"))
-    run_request = make_request(protocol, rig, folder)
+    run_request = requested(tmp_path / "a")
     store = Store.open(run_request.store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
     if per_m == 0.0:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.preflight import check
-from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.plugins.simulation.further_settings import Thermometer
 from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.plugins.simulation.thermometer import MockThermometer
@@ -38,9 +35,9 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_faults import slides
-from tests.flows.collecting.test_session import checksums, short, take_all
+from tests.flows.collecting.test_session import checksums, short
 from tests.flows.collecting.test_session import session as plain_session
-from tests.flows.conftest import write
+from tests.flows.conftest import take_all, write
 from tests.plugins.view.test_view import Read
 
 TRACKS = {"level": "tracks"}
@@ -94,21 +91,9 @@ def session(
     **mock: Any,
 ) -> tuple[TrialCollector, Campaign]:
     """A connected session on a mock rig with further devices."""
-    folder.mkdir(exist_ok=True)
-    rig_file = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
-    simulated = {**rig_file["mock"], "frame_camera": TRACKS, **mock}
-    text = json.dumps(
-        {**rig_file, "mock": simulated, "streams": streams, "cameras": list(cameras)},
-        default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
-    )
-    (folder / "rig.yaml").write_text(text)
-    run_request = make_request(
-        write(folder / "p.yaml", data or short()), folder / "rig.yaml", folder / "store"
-    )
-    campaign = describe_campaign(Store.create(folder / "store"), run_request)
-    rig = build_rig(run_request.rig)
-    rig.connect()
-    return TrialCollector(run_request.plan, run_request.rig, rig, campaign), campaign
+    shipped = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
+    rig = {"streams": streams, "cameras": list(cameras), "timing": shipped["timing"]}
+    return plain_session(folder, data or short(), rig, **mock)
 
 
 @pytest.fixture(scope="module")

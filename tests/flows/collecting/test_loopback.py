@@ -9,23 +9,21 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.flows.collecting.session import TrialCollector
-from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.devices.abb.settings import AbbSettings
-from sliplab.rigs.build import build_rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
+from tests.flows.conftest import take_all
 from tests.flows.live import (
     at_work,
     free_udp_port,
+    only_trial,
     quick,
     request_in,
     rig_yaml,
     stage_of,
-    take_all,
 )
 from tests.rigs.waiting import own_address
 
@@ -60,12 +58,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
         events_sent = stage.events_between(int(event_us[0]), int(event_us[-1]))
     mock = request_in(folder / "mock", quick(), folder / "rig.yaml")
     file = run_request.rig.model_copy(update={"driver": "mock", "devices": None})
-    other = describe_campaign(Store.create(mock.store), mock)
-    rig = build_rig(file)
-    rig.connect()
-    take_all(TrialCollector(mock.plan, file, rig, other))
-    (by_mock,) = other.recordings()
-    return Taken(recording, by_mock, sent, events_sent, run_request)
+    return Taken(recording, only_trial(mock, file), sent, events_sent, run_request)
 
 
 def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:

@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.force import plate_forces
-from sliplab.flows.collecting.session import TrialCollector
-from sliplab.flows.planning.run_request import RunRequest, describe_campaign
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import InputError
 from sliplab.protocols.timing import Delay, ForceTiming
-from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
-from tests.conftest import ROOT
-from tests.flows.conftest import write
-from tests.flows.live import at_work, quick, request_in, stage_of, take_all
+from tests.flows.conftest import take_all
+from tests.flows.live import at_work, only_trial, quick, request_in, rig_yaml, stage_of
 from tests.rigs.waiting import own_address
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
@@ -38,17 +35,12 @@ def force_yaml(folder: Path, sensor: str = "ati_net_ft", **mock: Any) -> Path:
     }
     settings, timing = kinds[sensor]
     timing["delay"]["longest_us"] = LONGEST_US
-    data = {
-        "extends": str(ROOT / "rigs" / "loopback.yaml"),
-        "name": "loopback",
-        "devices": {
-            "arm": {"host": own_address()},
-            "force_sensor": {"driver": sensor, **settings},
-        },
-        "timing": {"force": timing},
-        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}, "force": {}, **mock},
-    }
-    return write(folder / "rig.yaml", data)
+    return rig_yaml(
+        folder,
+        devices={"force_sensor": {"driver": sensor, **settings}},
+        timing={"force": timing},
+        mock={"force": {}, **mock},
+    )
 
 
 def wide() -> dict[str, Any]:
@@ -84,13 +76,8 @@ def agree(live: Recording, run_request: RunRequest, tmp_path: Path) -> None:
     force = ForceTiming(delay=Delay(shortest_us=0, longest_us=4000))
     timing = run_request.rig.timing.model_copy(update={"force": force})
     file = run_request.rig.model_copy(update={"driver": "mock", "devices": None, "timing": timing})
-    other = describe_campaign(Store.create(mock.store), mock)
-    rig = build_rig(file)
-    rig.connect()
-    take_all(TrialCollector(mock.plan, file, rig, other))
-    (by_mock,) = other.recordings()
     found = []
-    for recording in (live, by_mock):
+    for recording in (live, only_trial(mock, file)):
         forces = plate_forces(recording)
         held = forces.between(*recording.step("hold"))
         slid = forces.between(*recording.step("slide"))

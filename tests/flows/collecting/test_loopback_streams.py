@@ -13,9 +13,9 @@ from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
-from tests.flows.conftest import write
-from tests.flows.live import at_work, quick, request_in, stage_of, take_all
-from tests.rigs.waiting import own_address, until
+from tests.flows.conftest import take_all, write
+from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
+from tests.rigs.waiting import until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
@@ -26,21 +26,9 @@ SIDE = {
 }
 
 
-def two_event_cameras(folder: Path) -> Path:
-    """The shipped loopback rig with a second event camera in the sensor."""
-    data = {
-        "extends": str(ROOT / "rigs" / "loopback.yaml"),
-        "name": "loopback",
-        "devices": {"arm": {"host": own_address()}},
-        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}},
-        "streams": {"side": SIDE},
-    }
-    return write(folder / "rig.yaml", data)
-
-
 @pytest.mark.long
 def test_two_event_cameras_are_recorded_on_one_time_line(tmp_path: Path) -> None:
-    run_request = request_in(tmp_path / "live", quick(), two_event_cameras(tmp_path))
+    run_request = request_in(tmp_path / "live", quick(), rig_yaml(tmp_path, streams={"side": SIDE}))
     with stage_of(run_request.rig) as stage:
         with at_work(run_request, stage) as (work, campaign):
             take_all(work)
@@ -68,7 +56,7 @@ def test_two_event_cameras_are_recorded_on_one_time_line(tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_a_second_camera_that_is_unplugged_stops_the_arm(tmp_path: Path) -> None:
-    run_request = request_in(tmp_path / "live", quick(), two_event_cameras(tmp_path))
+    run_request = request_in(tmp_path / "live", quick(), rig_yaml(tmp_path, streams={"side": SIDE}))
     with (
         stage_of(run_request.rig) as stage,
         at_work(run_request, stage) as (work, campaign),

@@ -9,10 +9,8 @@ import pytest
 
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
-from tests.conftest import ROOT
-from tests.flows.conftest import write
-from tests.flows.live import at_work, quick, request_in, stage_of, take_all
-from tests.rigs.waiting import own_address
+from tests.flows.conftest import take_all
+from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("scene")]
 
@@ -21,33 +19,14 @@ RATE_HZ = 30
 
 def usb_rig(folder: Path) -> Path:
     """The shipped loopback rig with a USB camera in place of a Basler."""
-    exposure = {"exposure_us": 2000}
-    data = {
-        "extends": str(ROOT / "rigs" / "loopback.yaml"),
-        "name": "loopback",
-        "frame_camera": {
-            "scale_px_per_mm": 10,
-            "width_px": 640,
-            "height_px": 480,
-            "rate_hz": RATE_HZ,
-        },
-        "timing": {"frames": "host arrival"},
-        "devices": {
-            "arm": {"host": own_address()},
-            "frame_camera": {
-                "driver": "uvc",
-                "width_px": 640,
-                "height_px": 480,
-                "rate_hz": RATE_HZ,
-                **exposure,
-            },
-        },
-        "mock": {
-            "arm": {"start_xyz_mm": [397, 0, 300]},
-            "frame_camera": {"rate_hz": RATE_HZ},
-        },
-    }
-    return write(folder / "rig.yaml", data)
+    picture = {"width_px": 640, "height_px": 480, "rate_hz": RATE_HZ}
+    return rig_yaml(
+        folder,
+        frame_camera={"scale_px_per_mm": 10, **picture},
+        timing={"frames": "host arrival"},
+        devices={"frame_camera": {"driver": "uvc", "exposure_us": 2000, **picture}},
+        mock={"frame_camera": {"rate_hz": RATE_HZ}},
+    )
 
 
 @pytest.mark.long

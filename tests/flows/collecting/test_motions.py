@@ -139,14 +139,8 @@ def abb_yaml(folder: Path, driver: str = "abb") -> Path:
     if driver == "abb":
         reached |= {"rws_port": 8080, "egm_bind": "127.0.0.1", "egm_port": free_udp_port()}
     arm = {**reached, "tool": irb120["devices"]["arm"]["tool"], "limits": loopback["limits"]}
-    data = {
-        "extends": str(ROOT / "rigs" / "loopback.yaml"),
-        "name": "loopback",
-        "devices": {"arm": arm},
-        "timing": {**irb120["timing"], "pose_delay": {"shortest_us": 0, "longest_us": 200_000}},
-        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}},  # not far from the plate
-    }
-    return write(folder / "abb.yaml", data)
+    timing = {**irb120["timing"], "pose_delay": {"shortest_us": 0, "longest_us": 200_000}}
+    return rig_yaml(folder, devices={"arm": arm}, timing=timing)
 
 
 def twists(*angles_deg: int) -> dict[str, Any]:

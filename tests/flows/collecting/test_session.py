@@ -11,14 +11,13 @@ import pytest
 
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.planning.run_request import describe_campaign, make_request
+from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.yaml_file import parse_yaml
-from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
-from tests.flows.conftest import tiny, tiny_gravity, write
+from tests.flows.conftest import at_rig, requested, take_all, tiny, tiny_gravity, write
 
 
 def short() -> dict[str, Any]:
@@ -33,9 +32,9 @@ def short() -> dict[str, Any]:
 
 
 def session(
-    folder: Path, data: dict[str, Any], timing: dict[str, Any] | None = None, **mock: Any
+    folder: Path, data: dict[str, Any], rig: dict[str, Any] | None = None, **mock: Any
 ) -> tuple[TrialCollector, Campaign]:
-    """A connected session on a mock rig with other mock settings, and other timing.
+    """A connected session on a mock rig with other mock settings, and other keys.
 
     The frame camera makes tracks, not videos, which take most of the time.
     """
@@ -43,22 +42,12 @@ def session(
     mock.setdefault("frame_camera", {"level": "tracks"})
     rig_data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
     text = json.dumps(
-        {**rig_data, "mock": {**rig_data["mock"], **mock}, "timing": timing or {}},
+        {**rig_data, "mock": {**rig_data["mock"], **mock}, "timing": {}, **(rig or {})},
         default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
     )
     (folder / "rig.yaml").write_text(text)
-    run_request = make_request(
-        write(folder / "p.yaml", data), folder / "rig.yaml", folder / "store"
-    )
-    campaign = describe_campaign(Store.create(folder / "store"), run_request)
-    rig = build_rig(run_request.rig)
-    rig.connect()
-    return TrialCollector(run_request.plan, run_request.rig, rig, campaign), campaign
-
-
-def take_all(work: TrialCollector) -> None:
-    """Take what is pending."""
-    work.take(pending_trials(work.plan, work.campaign))
+    write(folder / "p.yaml", data)
+    return at_rig(requested(folder))
 
 
 def checksums(campaign: Campaign) -> dict[str, str]:
@@ -93,8 +82,7 @@ def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     assert campaign.committed() == set()
     assert len(campaign.quarantined()) == 6
     assert pending_trials(work.plan, campaign) == []
-    run_request = make_request(*(tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store")))
-    counts = run_request.counts(campaign)
+    counts = requested(tmp_path / "a").counts(campaign)
     assert counts["planned"] == counts["committed"] + counts["missing"] == 3
     assert len(counts["set_aside"]) == 3
 

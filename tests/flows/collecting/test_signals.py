@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,6 @@ from tests.crash.campaign import NAME, collect, run_request
 
 TRIALS = 3
 TIMES = [1, pytest.param(2, marks=pytest.mark.long), 10]
-
-
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
 
 
 @pytest.fixture

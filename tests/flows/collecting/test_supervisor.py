@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse
 from sliplab.flows.collecting.session import TrialCollector, open_session
 from sliplab.flows.collecting.supervisor import CollectionSupervisor, WindowOver
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
-from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.rigs.rig_file import load_rig_file
@@ -25,14 +25,7 @@ from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.crash import campaign as crash
 from tests.flows.collecting.test_session import checksums, session, short
-
-
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No stop request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
+from tests.flows.conftest import requested
 
 
 def supervised(
@@ -41,8 +34,7 @@ def supervised(
     """A collector with a supervisor, whose waits fail unless a test says what happens in them."""
     work, campaign = session(folder, data or short(), **mock)
     store = Store.open(folder / "store")
-    run_request = make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
-    work.supervisor = CollectionSupervisor(run_request, store, campaign)
+    work.supervisor = CollectionSupervisor(requested(folder), store, campaign)
 
     def never(seconds: float) -> None:
         raise AssertionError("waits")
@@ -146,8 +138,7 @@ def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
     work, _, store = supervised(tmp_path / "a")
     work.rig.close()
     control.ask(store, "stop")
-    run_request = make_request(*(tmp_path / "a" / name for name in ("p.yaml", "rig.yaml", "store")))
-    with open_session(run_request) as work_now:
+    with open_session(requested(tmp_path / "a")) as work_now:
         work_now.collector.rig.connect()
         work_now.collector.take(work_now.trials)
         assert work_now.collector.taken == 3

@@ -7,8 +7,8 @@ import threading
 from pathlib import Path
 
 from sliplab.flows.collecting.live_feed import STATE, LiveFeed, LiveFolder
-from sliplab.flows.planning.run_request import make_request
-from tests.flows.collecting.test_session import session, short, take_all
+from tests.flows.collecting.test_session import session, short
+from tests.flows.conftest import requested, take_all
 
 
 def test_viewers_change_no_byte(tmp_path: Path) -> None:
@@ -16,7 +16,7 @@ def test_viewers_change_no_byte(tmp_path: Path) -> None:
     take_all(alone)
     folder = tmp_path / "b"
     work, watched = session(folder, short())
-    feed = LiveFeed(make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store"))
+    feed = LiveFeed(requested(folder))
     work.feed = feed
     live, over, seen = LiveFolder(folder / "store"), threading.Event(), set()
 

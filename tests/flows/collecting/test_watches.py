@@ -16,19 +16,19 @@ from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.flows.planning.estimate import trial_bytes
-from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import InputError, load_plan
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import session, short
-from tests.flows.conftest import tiny, write
+from tests.flows.conftest import requested, tiny, write
 
 
 def begin(folder: Path, data: dict[str, Any]) -> tuple[TrialCollector, Campaign, RunRequest]:
     """A session and its run request."""
     work, campaign = session(folder, data)
-    return work, campaign, make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+    return work, campaign, requested(folder)
 
 
 def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:

@@ -20,17 +20,8 @@ from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json, write_json
 from tests.command_line import here
 from tests.conftest import ROOT
-from tests.flows.calibrating.test_calibrate import run
 from tests.flows.detect.detecting import RIG
 from tests.flows.detect.test_named import Recording
-
-
-@pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("skin") / "skin.json"
-    words = ("--hold", 5, "--yes", "--json")
-    assert run("calibrate", "detector", "--rig", RIG, "--out", out, *words) == 0
-    return out
 
 
 def test_live_evidence_is_the_stored_one_to_the_bit(

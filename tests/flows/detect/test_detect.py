@@ -16,18 +16,15 @@ from sliplab.analysis.detectors.smoothing_rule import detect as detect_trial
 from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.windows import bin_events
-from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
-from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.detection import Detection
-from sliplab.rigs.build import ShouldStop, build_rig
+from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detect import detecting
@@ -39,7 +36,7 @@ from tests.flows.detect.detecting import (
     slip_when_busy,
     stands_clear,
 )
-from tests.flows.live import request_in, take_all
+from tests.flows.live import only_trial, request_in
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +44,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The same trial as `collect` takes it, by a rig that looks as often: moves end with a look."""
     folder = tmp_path_factory.mktemp("stored")
     rig_file = write(folder / "r.yaml", {"extends": str(RIG), "poll": "5 ms"})
-    order = request_in(folder / "at", detecting.short_slide(), rig_file)
-    campaign = describe_campaign(Store.create(order.store), order)
-    rig = build_rig(order.rig)
-    rig.connect()
-    take_all(TrialCollector(order.plan, order.rig, rig, campaign))
-    (recording,) = campaign.recordings()
-    return recording
+    return only_trial(request_in(folder / "at", detecting.short_slide(), rig_file))
 
 
 @pytest.mark.parametrize(("outputs", "margin"), [(1, 2.0), (4, 8.0)])

@@ -8,7 +8,6 @@ import shlex
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -33,6 +32,8 @@ from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.listening import listening
+from tests.flows.programs import ended, running
+from tests.plugins.web.server.serving import until
 from tests.storage.remote.remotes import tree
 
 pytestmark = pytest.mark.programs
@@ -215,27 +216,33 @@ def test_what_cannot_be_used_is_said_at_once(
 
 
 @pytest.mark.long
-def test_the_commands_of_the_docs_listen_on_this_computer_only() -> None:
+def test_the_commands_of_the_docs_make_the_same_bytes(
+    taken: Path, here: dict[str, bytes], tmp_path: Path
+) -> None:
     places = ("docs/scale.md", "docs/howto/analyse-on-a-cluster.md")
     pages = [(ROOT / place).read_text() for place in places]
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    started: list[subprocess.Popen[bytes]] = []
-    try:
-        for kind in ("scheduler", "worker"):
-            found = [re.search(rf"^(?:\$ )?(dask {kind} .*)$", text, re.M)[1] for text in pages]  # type: ignore[index]
-            # both pages have the same command, but for how many workers there are
-            (line,) = {re.sub(r"--nworkers \d+", "--nworkers 1", each) for each in found}
-            words = shlex.split(line.replace("8786", port).replace("8787", "0"), comments=True)
-            command = [sys.executable, "-m", "distributed.cli.dask_" + kind, *words[2:]]
-            started.append(
-                subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            )
-        with distributed.Client(f"127.0.0.1:{port}", timeout="60s") as client:
-            client.wait_for_workers(1, timeout=60)
-        assert [listening(process.pid) for process in started] == [{"127.0.0.1"}] * 2
-    finally:
-        for process in reversed(started):
-            process.terminate()
-            process.wait(30)
+    store = shutil.copytree(taken, tmp_path / "store")
+
+    def documented(command: str) -> list[str]:
+        lines = [re.search(rf"^(?:\$ )?({command} .*)$", text, re.M)[1] for text in pages]  # type: ignore[index]
+        # both pages have the same command, but for the store and how many workers there are
+        for pattern, same in (("STORE| data", f" {store}"), (r"--nworkers \d+", "--nworkers 2")):
+            lines = [re.sub(pattern, same, line) for line in lines]
+        (words,) = {tuple(shlex.split(line, comments=True)) for line in lines}
+        program, *rest = [word.replace("8786", port).replace("8787", "0") for word in words]
+        return [str(Path(sys.executable).parent / program), *rest]
+
+    log = tmp_path / "worker"
+    with (
+        running(documented("dask scheduler"), tmp_path / "scheduler", cwd=tmp_path) as scheduler,
+        running(documented("dask worker"), log, cwd=tmp_path) as worker,
+    ):
+        until("two workers", lambda: log.read_text().count("Registered to") >= 2)
+        done = ended(documented("sliplab label"), 180)
+        assert done.returncode == 0, done.stderr + log.read_text()
+        assert [listening(each.pid) for each in (scheduler, worker)] == [{"127.0.0.1"}] * 2
+    labels = {name: data for name, data in here.items() if name.startswith("derived/labels")}
+    assert tree(store, "derived/labels") == labels

@@ -14,7 +14,7 @@ from prefect.exceptions import Abort, CancelledRun, PausedRun
 
 from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
-from sliplab.flows.running.orchestration import Opaque, WorkNotBegun, run
+from sliplab.flows.running.orchestration import WorkNotBegun, run
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
@@ -55,10 +55,10 @@ def test_server_in_a_home_that_is_missing_says_so(tmp_path: Path) -> None:
 
 
 @flow(name="counted", validate_parameters=False, persist_result=False)
-def counted(argument: Opaque[list[str]]) -> int:
+def counted(done: list[str]) -> int:
     """Count how often the work was done."""
-    argument.content.append("done")
-    return len(argument.content)
+    done.append("done")
+    return len(done)
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_failed_record_of_a_begin_is_the_error_of_the_run(
     monkeypatch.setattr(run_records, "begin", refuse)
     done: list[str] = []
     with pytest.raises(OSError, match="No space left"):
-        run(counted, Opaque(done))
+        run(counted, done)
     assert done == []
 
 
@@ -94,12 +94,12 @@ def test_client_that_cannot_be_made_is_an_error(
     monkeypatch.setattr(orchestration, "_lost_servers", set())
     done: list[str] = []
     if not unreachable:
-        assert run(counted, Opaque(done)) == 1
+        assert run(counted, done) == 1
     else:
         with monkeypatch.context() as patch:
             patch.setattr("prefect.context.get_client", fail)
             with pytest.raises(ImportError, match="no SOCKS"):
-                run(counted, Opaque(done))
+                run(counted, done)
     assert len(done) == (0 if unreachable else 1)
 
 
@@ -114,7 +114,7 @@ def test_run_that_the_server_ends_before_its_work_raises(
     monkeypatch.setattr("prefect.flow_engine.run_flow", end)
     done: list[str] = []
     with pytest.raises(WorkNotBegun, match="ended the run before its work began"):
-        run(counted, Opaque(done))
+        run(counted, done)
     assert done == []
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -13,17 +12,9 @@ from prefect.cache_policies import NO_CACHE
 from prefect.flow_engine import FlowRunEngine
 
 from sliplab.flows.running import stopping
-from sliplab.flows.running.orchestration import Opaque, run
+from sliplab.flows.running.orchestration import run
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-
-
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
 
 
 def send(number: int) -> None:
@@ -37,9 +28,8 @@ def interrupted_task(number: int) -> None:
 
 
 @flow(name="interrupted", validate_parameters=False, persist_result=False)
-def interrupted_flow(argument: Opaque[tuple[int, bool]]) -> str:
+def interrupted_flow(number: int, in_task: bool) -> str:
     """Send a signal to its own process, in a task or not."""
-    number, in_task = argument.content
     if in_task:
         interrupted_task(number)
     else:
@@ -48,16 +38,16 @@ def interrupted_flow(argument: Opaque[tuple[int, bool]]) -> str:
 
 
 @flow(name="quiet", validate_parameters=False, persist_result=False)
-def quiet_flow(argument: Opaque[str]) -> str:
+def quiet_flow(argument: str) -> str:
     """Return its argument."""
-    return argument.content
+    return argument
 
 
 @pytest.mark.parametrize("in_task", [False, True])
 @pytest.mark.parametrize("number", SIGNALS)
 def test_signal_in_the_work_raises_keyboard_interrupt(number: int, in_task: bool) -> None:
     with stopping.signals(), pytest.raises(KeyboardInterrupt):
-        run(interrupted_flow, Opaque((number, in_task)))
+        run(interrupted_flow, number, in_task)
 
 
 @pytest.mark.parametrize("name", ["begin_run", "handle_success", "_report_attempt_conclusion"])
@@ -75,4 +65,4 @@ def test_signal_in_prefects_engine_raises_keyboard_interrupt(
 
     monkeypatch.setattr(FlowRunEngine, name, method)
     with stopping.signals(), pytest.raises(KeyboardInterrupt):
-        run(quiet_flow, Opaque("done"))
+        run(quiet_flow, "done")

@@ -22,7 +22,6 @@ from sliplab.flows.running.orchestration import (
     BEGIN_S,
     END_S,
     LOST_S,
-    Opaque,
     ServerLink,
     embedded,
     run,
@@ -40,9 +39,9 @@ def quick(number: int) -> int:
 
 
 @flow(name="many", validate_parameters=False, persist_result=False)
-def many(reported: Opaque[list[str]]) -> None:
+def many(reported: list[str]) -> None:
     """Many quick tasks, of which the last fails."""
-    reported.content.append(str(flow_run.id))
+    reported.append(str(flow_run.id))
     for number in range(COUNT):
         quick(number)
 
@@ -50,7 +49,7 @@ def many(reported: Opaque[list[str]]) -> None:
 def test_every_quick_task_run_is_kept_with_its_end() -> None:
     reported: list[str] = []
     with pytest.raises(ValueError, match="the last one fails"):
-        run(many, Opaque(reported))
+        run(many, reported)
     _drained(reported[0], COUNT)
     found: list[dict[str, Any]] = []
     for offset in (0, 100):

@@ -94,14 +94,6 @@ def test_a_program_that_outlives_its_terminal_is_not_stopped_by_it() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.fixture(autouse=True)
-def forget() -> Iterator[None]:
-    """No request outlives its test."""
-    yield
-    with stopping.signals():
-        pass
-
-
 ORPHANS = """
 import os
 from concurrent.futures import ProcessPoolExecutor
