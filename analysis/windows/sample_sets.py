@@ -151,16 +151,4 @@ def _make(
 
 
 def _samples(recording: Recording, inputs: _SampleInputs) -> SampleSet:
-    if inputs.classes:
-        return dataset.span_samples(
-            recording,
-            inputs.label,
-            inputs.trial,
-            inputs.windows,
-            inputs.samples.per_class,
-            inputs.classes,
-            inputs.seed,
-        )
-    return dataset.trial_samples(
-        recording, inputs.label, inputs.trial, inputs.windows, inputs.samples, inputs.seed
-    )
+    return dataset.trial_samples(recording, **vars(inputs))
