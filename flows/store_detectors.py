@@ -75,7 +75,7 @@ def store_detectors(
         if promise is None:
             made = work.tune(store, settings, rule)
         else:
-            rows = [row.found for row in work.promise(store, settings, rule, promise)]
+            rows = work.promise(store, settings, rule, promise)
             made = [row.rule for row in rows]
             promised = {row.rule.name: row.level for row in rows}
         detectors += [(settings.fine_stride_ms, it) for it in made]
