@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sliplab.analysis.labels.doubts import Doubts, slipped_in_hold, unseen
+from sliplab.analysis.labels.doubts import first_doubts, slipped_in_hold, unseen
 from sliplab.analysis.labels.event_slips import AT_REST_MM, PapillaSlips, slips
 from sliplab.analysis.labels.event_tracking import (
     EventTracks,
@@ -25,6 +25,7 @@ from sliplab.analysis.labels.event_tracking import (
 from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, last_off_axis, paper_onsets
 from sliplab.analysis.labels.slip_times import SlipTimes
 from sliplab.protocols.labelling import Labelling
+from sliplab.storage.schema.label import OnsetDoubts
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 
@@ -79,10 +80,10 @@ class EventOnsets:
     sigma_px: F64
     hold_slip_px: F64
     paper: LabelOnsets
-    paper_doubts: Doubts
+    paper_doubts: OnsetDoubts
     intervals: tuple[Interval | None, Interval | None]
     slips: SlipTimes
-    slip_doubts: Doubts
+    slip_doubts: OnsetDoubts
     tracks: EventTracks | None
 
 
@@ -223,10 +224,9 @@ def _onsets(
         t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns
     )
 
-    def doubts(onsets: LabelOnsets) -> Doubts:
-        return held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns)).or_else(
-            _near_lost(onsets, lost_ns)
-        )
+    def doubts(onsets: LabelOnsets) -> OnsetDoubts:
+        hidden = unseen(t_ns, moved_px, onsets, centre, start_ns)
+        return first_doubts(held, hidden, _near_lost(onsets, lost_ns))
 
     return EventOnsets(
         t_ns,
@@ -234,10 +234,10 @@ def _onsets(
         sigma,
         hold,
         paper,
-        doubts(paper).or_else(_wide(intervals)),
+        first_doubts(doubts(paper), _wide(intervals)),
         intervals,
         slip_times,
-        doubts(slip_times.onsets).or_else(slip_times.doubts()),
+        first_doubts(doubts(slip_times.onsets), slip_times.doubts()),
         tracks,
     )
 
@@ -286,31 +286,31 @@ def crossing_intervals(
     return incipient, gross
 
 
-def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
+def _wide(intervals: tuple[Interval | None, Interval | None]) -> OnsetDoubts:
     reasons = [
         f"the crossing is only known to {known.width_ns / 1e6:.0f} ms"
         if known is not None and known.width_ns > WIDEST_NS
         else None
         for known in intervals
     ]
-    return Doubts(*reasons)
+    return OnsetDoubts(incipient=reasons[0], gross=reasons[1])
 
 
-def _near_lost(onsets: LabelOnsets, lost_ns: I64) -> Doubts:
+def _near_lost(onsets: LabelOnsets, lost_ns: I64) -> OnsetDoubts:
     """Return doubts about onsets near lost events."""
 
     def of(onset: int | None) -> str | None:
         near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())
         return "events were lost close to it" if near else None
 
-    return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
+    return OnsetDoubts(incipient=of(onsets.incipient_ns), gross=of(onsets.gross_ns))
 
 
 def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
     """Return the result of a trial that cannot be labelled, with the reason."""
     none = np.full(markers, NO_ONSET, np.int64)
     unknown = np.full((len(t_ns), markers), np.nan)
-    doubts = Doubts(reason, reason)
+    doubts = OnsetDoubts(incipient=reason, gross=reason)
     return EventOnsets(
         t_ns,
         unknown,

@@ -14,9 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.labels.camera_shift import CameraShift, no_shift
-from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
+from sliplab.analysis.labels.doubts import (
+    MAX_UNSEEN_NS,
+    first_doubts,
+    slipped_in_hold,
+    uncertain,
+    unseen,
+)
 from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
-from sliplab.analysis.labels.force_onsets import ForceOnsets, onsets_by_force
+from sliplab.analysis.labels.force_onsets import onsets_by_force
 from sliplab.analysis.labels.given_labels import given_label
 from sliplab.analysis.labels.onsets import (
     NO_ONSET,
@@ -62,7 +68,7 @@ class HoldEndOnsets:
     """
 
     onsets: LabelOnsets
-    doubts: Doubts
+    doubts: OnsetDoubts
     displacement_px: F64
 
 
@@ -89,7 +95,7 @@ class Label:
     reference: Reference
     references: dict[Reference, HoldEndOnsets]
     slips: SlipTimes
-    slip_doubts: Doubts
+    slip_doubts: OnsetDoubts
     frame_ns: npt.NDArray[np.int64]
     hold_slip_px: F64
     places: Places
@@ -98,7 +104,7 @@ class Label:
     stop_ns: int
     rest_ns: int | None
     source: str
-    force: ForceOnsets | None = None
+    force: RuleOnsets | None = None
     intervals: OnsetIntervals | None = None
 
     @property
@@ -107,7 +113,7 @@ class Label:
         return self.references[self.reference].onsets
 
     @property
-    def paper_doubts(self) -> Doubts:
+    def paper_doubts(self) -> OnsetDoubts:
         """Doubts of the paper's onsets."""
         return self.references[self.reference].doubts
 
@@ -126,11 +132,11 @@ class Label:
         return self.paper if self.rule == "paper" else self.slips.onsets
 
     @property
-    def doubts(self) -> Doubts:
+    def doubts(self) -> OnsetDoubts:
         """Doubts of the onsets by the protocol's rule."""
         if self.rule == "force":
             reason = None if self.force is not None else "the trial has no forces of a slide"
-            return Doubts(reason, reason)
+            return OnsetDoubts(incipient=reason, gross=reason)
         return self.paper_doubts if self.rule == "paper" else self.slip_doubts
 
     @property
@@ -212,7 +218,7 @@ class Label:
         )
         only_some: dict[str, Any] = {}
         if self.force is not None:
-            only_some["force"] = self.force.document()
+            only_some["force"] = self.force
         if self.intervals is not None:
             only_some["intervals"] = self.intervals
         return label.model_copy(update=only_some) if only_some else label
@@ -314,7 +320,7 @@ def label_places(
     exposure_ns: int,
     source: str,
     twists: bool = False,
-    force: ForceOnsets | None = None,
+    force: RuleOnsets | None = None,
 ) -> Label:
     """Apply both rules to a trial's positions.
 
@@ -349,9 +355,7 @@ def label_places(
         vague = uncertain(
             frame_ns, moved, found.sigma, paper, centre, settings.threshold_px, from_ns
         )
-        return HoldEndOnsets(
-            paper, held.or_else(lost).or_else(vague).or_else(knocked(paper)), moved
-        )
+        return HoldEndOnsets(paper, first_doubts(held, lost, vague, knocked(paper)), moved)
 
     references: dict[Reference, HoldEndOnsets] = {
         "hold_start": counted("hold_start", int(frame_ns[0])),
@@ -371,11 +375,8 @@ def label_places(
         settings.threshold_px,
     )
     moved = references["hold_end"].displacement_px
-    slip_doubts = (
-        held.or_else(unseen(frame_ns, moved, slips.onsets, centre, start_ns))
-        .or_else(slips.doubts())
-        .or_else(knocked(slips.onsets))
-    )
+    hidden = unseen(frame_ns, moved, slips.onsets, centre, start_ns)
+    slip_doubts = first_doubts(held, hidden, slips.doubts(), knocked(slips.onsets))
     return Label(
         settings.rule,
         settings.reference,
@@ -398,14 +399,14 @@ def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:
     """Return doubts about onsets after the camera moved while too few markers were at rest."""
     moved = frame_ns[camera.unsure]
 
-    def doubts(onsets: LabelOnsets) -> Doubts:
+    def doubts(onsets: LabelOnsets) -> OnsetDoubts:
         reason = "the camera moved while too few markers stood still to tell how far"
 
         def of(onset: int | None) -> str | None:
             late = onset is None or (len(moved) and int(moved[0]) <= onset)
             return reason if len(moved) and late else None
 
-        return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
+        return OnsetDoubts(incipient=of(onsets.incipient_ns), gross=of(onsets.gross_ns))
 
     return doubts
 
@@ -414,12 +415,12 @@ def _thousandths(values: F64) -> npt.NDArray[np.float32]:
     return np.round(values, 3).astype(np.float32)
 
 
-def _doubts(doubts: Doubts) -> OnsetDoubts:
+def _doubts(doubts: OnsetDoubts) -> OnsetDoubts:
     """A gross onset after an incipient one that is not known is not known either."""
     return OnsetDoubts(incipient=doubts.incipient, gross=doubts.gross or doubts.incipient)
 
 
-def _onsets(onsets: LabelOnsets, doubts: Doubts) -> dict[str, Any]:
+def _onsets(onsets: LabelOnsets, doubts: OnsetDoubts) -> dict[str, Any]:
     return {
         "incipient_ns": onsets.incipient_ns,
         "gross_ns": onsets.gross_ns,
