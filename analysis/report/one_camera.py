@@ -260,8 +260,7 @@ def one_camera_sections(
         skin_section(campaigns),
     ]
     if summary.labels is not None:
-        distances = label_errors.distances(store, campaigns)
-        sections.append(label_section(store, campaigns, summary, distances))
+        sections.append(label_section(store, campaigns, summary))
     sections.append(rate_section(campaigns, summary))
     if summary.one_camera == "events":
         page = (store.folder / "report" / clocks.PAGE).exists()

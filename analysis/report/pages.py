@@ -81,7 +81,7 @@ def _evaluated(
     """
     sources = read_sources(store, campaigns, planned, seconds)
     summary = make_summary(sources)
-    sections = report.make_sections(sources, summary, report.read_shown(sources))
+    sections = report.make_sections(sources, summary)
     numbers = summary.to_json()
     if without_frames is not None:
         rates = one_camera.rate_section(campaigns, without_frames)
