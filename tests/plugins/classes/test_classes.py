@@ -103,10 +103,9 @@ def test_accuracy_by_length_is_that_of_spikes_so_far(judged: Store) -> None:
     found = class_evaluation_of(judged)
     fitted = model_file.load(judged.folder / "models" / f"classes-seed{found.seed}.pt")
     test = samples(judged, "test")
-    stream = fitted.engine.stream()
     spikes = []
     for window in test.x:
-        stream.reset()
+        stream = fitted.engine.stream()
         spikes.append([stream.push(plane) for plane in window])
     so_far = np.cumsum(np.array(spikes, np.int64), axis=1)  # window, step, class
     step_ms = fitted.windows.step_ms
