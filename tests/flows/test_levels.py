@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from sliplab.analysis.labels.labelling import Label, label_recording
+from sliplab.analysis.labels.label import Label
+from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import describe_campaign, make_request
