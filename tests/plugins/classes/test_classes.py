@@ -17,7 +17,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.baseline_nets import TAXEL_KINDS
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.sample_sets import load_class_samples
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
 from sliplab.flows.planning.json_schemas import file_schema
@@ -57,7 +57,8 @@ def copied(judged: Store, tmp_path: Path) -> Store:
 
 def samples(store: Store, split: str) -> SampleSet:
     """The samples of a part of the split."""
-    return load_class_samples(StoreLabels(store), collected(store), split)
+    campaigns = collected(store)
+    return load_samples(StoreLabels(store), campaigns, split, classes=class_names(campaigns))
 
 
 def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: Store) -> None:
