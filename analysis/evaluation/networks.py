@@ -328,11 +328,8 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     if judging.threads is not None:
         training.limit_threads(judging.threads)
     counts = _counter(network.content, network.description, network.engine)
-    starts = dataset.run_starts(recording, network.windows, judging.stride_ms)
-    found = {
-        "counts": counts(dataset.cut_windows(recording, starts, network.windows)),
-        "end_ns": starts + network.windows.length_ms * 1_000_000,
-    }
+    windows, end_ns = dataset.trial_windows(recording, network.windows, judging.stride_ms)
+    found = {"counts": counts(windows), "end_ns": end_ns}
     if judging.label is not None:
         trial = dataset.TrialId(recording.folder.parents[1].name, recording.folder.name)
         samples = dataset.trial_samples(
