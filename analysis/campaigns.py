@@ -291,18 +291,18 @@ def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
         StoreError: there is none.
         InputError: they disagree on how windows are made.
     """
-    found = kinematic_campaigns(campaigns)
-    for item in found:
-        item.need("events", "the network is trained on windows of them")
-    return agreeing(found)
+    return agreeing(kinematic_campaigns(campaigns))
 
 
 def agreeing(found: list[Collected]) -> list[Collected]:
-    """Return campaigns whose windows are made alike.
+    """Return campaigns whose windows of events are made alike.
 
     Raises:
-        InputError: they are not.
+        StoreError: one was recorded without events.
+        InputError: they are not made alike.
     """
+    for item in found:
+        item.need("events", "the network is trained on windows of them")
     for other in found[1:]:
         if other.settings.windows != found[0].settings.windows:
             raise InputError(

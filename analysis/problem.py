@@ -286,8 +286,7 @@ class SlipByEvents(EventProblem):
                 seed_step(model.seed),
                 job.detection[item.name].stride_ms,
             )
-        windows = self.used()[0].settings.windows
-        predict_trials(store, job.model.path, windows, job.detectors.requests, keep, threads)
+        predict_trials(store, job.model.path, job.detectors.requests, keep, threads)
         return {split: self.samples(split, workers.each(split)) for split in ("train", "test")}
 
     def evaluate(self, job: evaluation.EvaluationJob, parts: Mapping[str, SampleSet]) -> None:

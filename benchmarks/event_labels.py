@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
+from sliplab.analysis.labels.event_labels import onsets_by_events
+from sliplab.analysis.labels.label import Label
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.protocols.labelling import Labelling
@@ -155,24 +156,24 @@ class OnsetErrors:
     wrong: int = 0
     seconds: float = 0.0
 
-    def add(self, found: EventOnsets, recording: Recording) -> None:
+    def add(self, found: Label, recording: Recording) -> None:
         """Hold a trial's onsets by the paper's rule against the true crossings."""
         truth = recording.simulation_truth() or {}
-        for number, kind in enumerate(KINDS):
+        for kind in KINDS:
             doubts = found.paper_doubts
             if doubts.incipient is not None or (kind == "gross" and doubts.gross is not None):
                 self.doubts[kind] += 1
                 continue
             at, true = getattr(found.paper, f"{kind}_ns"), truth.get(f"{kind}_ns")
-            if true is not None and true > found.t_ns[-1]:
+            if true is not None and true > found.frame_ns[-1]:
                 true = None  # it came with the release
             if at is None or true is None:
                 self.wrong += at is not true
                 continue
             error = (at - true) / 1e6
-            interval = found.intervals[number]
+            interval = getattr(found.intervals, f"{kind}_ns")
             self.errors_ms[kind].append(error)
-            self.inside.append(interval is not None and interval.low_ns <= true <= interval.high_ns)
+            self.inside.append(interval is not None and interval[0] <= true <= interval[1])
             self.wrong += abs(error) > WRONG_MS
 
     def row(self, name: str) -> str:
@@ -268,12 +269,12 @@ def tracks(recordings: Sequence[Recording]) -> list[str]:
             label_recording(recording, Labelling()),
         )
         seen = np.stack(
-            [np.interp(found.t_ns, frames.frame_ns, row) for row in frames.displacement_px.T], 1
+            [np.interp(found.frame_ns, frames.frame_ns, row) for row in frames.displacement_px.T], 1
         )
-        near = (found.t_ns > frames.start_ns)[:, None] & (seen < 4.0)
+        near = (found.frame_ns > frames.start_ns)[:, None] & (seen < 4.0)
         near &= (seen > 0.5) & np.isfinite(found.displacement_px)
         off.append((found.displacement_px - seen)[near])
-        z.append(np.abs(off[-1]) / found.sigma_px[near])
+        z.append(np.abs(off[-1]) / found.places.sigma[near])
         for kind in KINDS:
             mine, other = (getattr(each.paper, f"{kind}_ns") for each in (found, frames))
             doubts = found.paper_doubts

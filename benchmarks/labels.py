@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import cv2
 import numpy as np
 
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
-from sliplab.analysis.labels.markers import MarkerTracks, track
+from sliplab.analysis.labels.markers import MarkerTracks
 from sliplab.analysis.labels.plate_tracking import VideoTracks, track_video
 from sliplab.plugins.simulation.scene.frames import FrameOptics, PlateView
 from sliplab.plugins.simulation.settings import MockFrameCameraSettings, MockSettings
@@ -54,6 +55,11 @@ PARAMETERS = {
     "tuned SimpleBlobDetector": TUNED,
     "threshold + connectedComponentsWithStats": {"threshold": LEVEL, "connectivity": 8},
 }
+
+
+def track(frames: Iterable[U8], layout_px: F64) -> MarkerTracks:
+    """Track the markers alone."""
+    return track_video(frames, layout_px, with_plate=False).markers
 
 
 def measure(frames: int = 600, runs: int = RUNS) -> Figures:

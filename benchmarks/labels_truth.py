@@ -24,7 +24,8 @@ import numpy.typing as npt
 
 from benchmarks.labels_summary import FRAME_MS, Checked, summary, tables, verdicts
 from benchmarks.measure import SEED, Figures
-from sliplab.analysis.labels.labelling import Label, label_places
+from sliplab.analysis.labels.label import Label
+from sliplab.analysis.labels.labelling import label_places
 from sliplab.analysis.labels.markers import FrameMarkers, MarkerTracker, stack_tracks
 from sliplab.analysis.labels.places import from_tracks
 from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge

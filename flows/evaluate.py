@@ -111,10 +111,10 @@ def _promises(job: EvaluationJob, promise: float) -> list[PromisedDetector]:
     settings = training_settings(job.campaigns)
     rows = []
     for row in job.detectors.promise(job.store, settings, rule, promise):
-        level = row.found.level
+        level = row.level
         rows.append(
             PromisedDetector(
-                detector=row.found.rule.name,
+                detector=row.rule.name,
                 simulated=job.store.simulated,
                 level=level.value if np.isfinite(level.value) else None,
                 promised=level.promised,

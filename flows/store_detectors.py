@@ -71,11 +71,11 @@ def store_detectors(
     work = detector_work(StoreLabels(store), campaigns, rules, model.key)
     if work.compared is not None and settings.fine_stride_ms is not None:
         keep = spike_keeper(store, None)
-        predict_trials(store, model.path, settings.windows, work.requests, keep)
+        predict_trials(store, model.path, work.requests, keep)
         if promise is None:
             made = work.tune(store, settings, rule)
         else:
-            rows = [row.found for row in work.promise(store, settings, rule, promise)]
+            rows = work.promise(store, settings, rule, promise)
             made = [row.rule for row in rows]
             promised = {row.rule.name: row.level for row in rows}
         detectors += [(settings.fine_stride_ms, it) for it in made]

@@ -35,6 +35,8 @@ MOVED = {
     "sliplab.flows.scene_runs": "sliplab.plugins.simulation.scene_runs",
     "sliplab.rigs.devices": "sliplab.plugins.devices",
     "sliplab.rigs.levels": "sliplab.plugins.simulation.levels",
+    "sliplab.analysis.metrics.paired": "sliplab.plugins.studies.detector.paired",
+    "sliplab.analysis.metrics.pareto": "sliplab.plugins.studies.detector.pareto",
     "sliplab.storage.workers": "sliplab.storage.spawn_context",
 }
 """Old names of packages and modules, and what they are now."""

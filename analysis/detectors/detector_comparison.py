@@ -46,7 +46,7 @@ from sliplab.analysis.detectors.onset_references import (
 )
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.detection import ComparisonSettings, Detection
-from sliplab.protocols.windows import Windows
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import (
     AlarmRate,
     CurvePoint,
@@ -178,41 +178,40 @@ class Parts:
 
 
 def compare(
-    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
+    parts: Parts, settings: AnalysisSettings, detection: Detection
 ) -> DetectorComparison | None:
     """Compare every detector at every stride and rate.
 
     Args:
-        windows: their length.
-        settings: smoothing of the paper's rule, the grid of smoothings, what is false early, and
+        settings: windows and their finer stride, which divides their length.
+        detection: smoothing of the paper's rule, the grid of smoothings, what is false early, and
             the rates that are compared.
-        fine_ms: the finer stride; divides the window's length.
-        most: spikes that a class can give in a window.
 
     Returns:
         None where nothing is to be compared, or training, validation or test trials are missing.
     """
-    asked = settings.compare
-    if asked is None or not (parts.train and parts.validation and parts.test):
+    asked, fine_ms = detection.compare, settings.fine_stride_ms
+    if asked is None or fine_ms is None or not (parts.train and parts.validation and parts.test):
         return None
-    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
+    length_ms = settings.windows.length_ms
+    learned = _learned(parts, settings)
     found = []
-    for stride in sorted({windows.length_ms, fine_ms}, reverse=True):
+    for stride in sorted({length_ms, fine_ms}, reverse=True):
         every = stride // fine_ms
         validation = [thinned(trial, every) for trial in parts.validation]
         test = [thinned(trial, every) for trial in parts.test]
-        for name, choices in _detectors(learned, windows, settings, stride).items():
+        for name, choices in _detectors(learned, settings, detection, stride).items():
             judged = {
                 key: (judge(detector, validation), judge(detector, test))
                 for key, detector in choices.items()
             }
-            rates, curve = _scores(judged, settings, asked)
+            rates, curve = _scores(judged, detection, asked)
             found.append(DetectorScores(name=name, stride_ms=stride, rates=rates, curve=curve))
     return DetectorComparison(
         trials=PartTrials(
             train=len(parts.train), validation=len(parts.validation), test=len(parts.test)
         ),
-        strides_ms=tuple(sorted({windows.length_ms, fine_ms})),
+        strides_ms=tuple(sorted({length_ms, fine_ms})),
         detectors=tuple(found),
     )
 
@@ -222,42 +221,38 @@ def thinned(trial: TrialWithSlip, every: int) -> TrialWithSlip:
     return replace(trial, predictions=trial.predictions[::every])
 
 
+def _learned(parts: Parts, settings: AnalysisSettings) -> Learned:
+    return learn(parts.train, settings.windows.length_ms * 1_000_000, settings.most_spikes)
+
+
 @dataclass(frozen=True)
 class PromisedRule:
-    """A rule whose incipient level validation trials set by a promise of false alarms.
+    """A rule whose incipient level validation trials set by a promise, with its test figures.
 
     Attributes:
-        choice: chosen smoothing, windows; 0 if there is nothing to choose.
         level: of the incipient evidence.
+        test: false alarms on test trials; None without any.
+        median_ms: incipient latency on them, a missed one infinite; None if so.
     """
 
     rule: Tuned
-    choice: int
     level: Level
-
-    def rate_on(self, trials: Sequence[TrialWithSlip], false_early_ns: int) -> AlarmRate:
-        """Return the rate of false alarms on trials; there are some."""
-        found = scenes_of(judge(self.rule.detector, trials), false_early_ns)
-        return false_alarm_rate(found, self.level.value)
-
-    def median_ms(self, trials: Sequence[TrialWithSlip], false_early_ns: int) -> float | None:
-        """Return the median latency of incipient slip, a missed one infinite; None if so."""
-        judged = judge(self.rule.detector, trials)
-        return _plain(merit(outcomes(judged, self.rule.levels, false_early_ns))[0])
+    test: AlarmRate | None
+    median_ms: float | None
 
 
-def tuned(
-    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int, rate: float
-) -> list[Tuned]:
-    """Fit every detector at the finer stride, at a rate of false early validation trials.
+def tuned(parts: Parts, settings: AnalysisSettings, detection: Detection) -> list[Tuned]:
+    """Fit every detector at the finer stride, at the middle of the rates that are compared.
 
     Args:
-        windows, settings, fine_ms, most: see `compare`. rate: share of the trials.
+        settings, detection: see `compare`.
+
+    Returns:
+        none where nothing is to be compared, or training or validation trials are missing.
     """
-    tolerance = round(settings.false_early_ms * 1e6)
-    allowed = allowed_early(rate, len(parts.validation))
+    tolerance = round(detection.false_early_ms * 1e6)
     found = []
-    for name, choices, judged in _judged(parts, windows, settings, fine_ms, most):
+    for name, choices, judged, allowed in _judged(parts, settings, detection):
         levels = {key: set_levels(trials, allowed, tolerance) for key, trials in judged.items()}
         key = _quickest(judged, levels, tolerance)
         found.append(Tuned(name, choices[key], levels[key]))
@@ -265,45 +260,56 @@ def tuned(
 
 
 def promised(
-    parts: Parts,
-    windows: Windows,
-    settings: Detection,
-    fine_ms: int,
-    most: int,
-    rate: float,
-    promise: float,
+    parts: Parts, settings: AnalysisSettings, detection: Detection, promise: float
 ) -> list[PromisedRule]:
     """Fit every detector at the finer stride, at a promise of false alarms.
 
     The choice among several of a detector is made after their levels, by the same trials; each
-    level keeps its promise with 95 % alone.
+    level keeps its promise with 95 % alone. Gross slip has the level that `tuned` gives it.
 
     Args:
-        windows, settings, fine_ms, most: see `compare`.
-        rate: share of the validation trials that may be false early for gross slip.
+        settings, detection: see `compare`.
         promise: false alarms an hour without slip, at most.
+
+    Returns:
+        as `tuned`.
     """
-    tolerance = round(settings.false_early_ms * 1e6)
-    allowed = allowed_early(rate, len(parts.validation))
+    tolerance = round(detection.false_early_ms * 1e6)
     found = []
-    for name, choices, judged in _judged(parts, windows, settings, fine_ms, most):
+    for name, choices, judged, allowed in _judged(parts, settings, detection):
         set_by, levels = {}, {}
         for key, trials in judged.items():
             (level,) = promised_levels(scenes_of(trials, tolerance), [promise])
             gross = _gross_level(trials, level.value, allowed, tolerance)
             set_by[key], levels[key] = level, Levels(level.value, gross)
         key = _quickest(judged, levels, tolerance)
-        found.append(PromisedRule(Tuned(name, choices[key], levels[key]), key, set_by[key]))
+        level, test = set_by[key], judge(choices[key], parts.test)
+        found.append(
+            PromisedRule(
+                Tuned(name, choices[key], levels[key]),
+                level,
+                false_alarm_rate(scenes_of(test, tolerance), level.value) if test else None,
+                _plain(merit(outcomes(test, levels[key], tolerance))[0]),
+            )
+        )
     return found
 
 
 def _judged(
-    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
-) -> Iterator[tuple[str, dict[int, DetectionRule], dict[int, list[TrialEvidence]]]]:
-    """Yield each detector's name, its choices, and their evidence on validation trials."""
-    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
-    for name, choices in _detectors(learned, windows, settings, fine_ms).items():
-        yield name, choices, {key: judge(it, parts.validation) for key, it in choices.items()}
+    parts: Parts, settings: AnalysisSettings, detection: Detection
+) -> Iterator[tuple[str, dict[int, DetectionRule], dict[int, list[TrialEvidence]], int]]:
+    """Yield each detector's name, its choices, and their evidence on validation trials.
+
+    The last value is how many of these may be false early, by the middle of the rates.
+    """
+    asked, fine_ms = detection.compare, settings.fine_stride_ms
+    if asked is None or fine_ms is None or not (parts.train and parts.validation):
+        return
+    allowed = allowed_early(asked.rates[len(asked.rates) // 2], len(parts.validation))
+    detectors = _detectors(_learned(parts, settings), settings, detection, fine_ms)
+    for name, choices in detectors.items():
+        judged = {key: judge(it, parts.validation) for key, it in choices.items()}
+        yield name, choices, judged, allowed
 
 
 def _quickest(
@@ -314,13 +320,13 @@ def _quickest(
 
 
 def _detectors(
-    learned: Learned, windows: Windows, settings: Detection, stride_ms: int
+    learned: Learned, settings: AnalysisSettings, detection: Detection, stride_ms: int
 ) -> dict[str, dict[int, DetectionRule]]:
     """Detectors by name; where there are several, the validation trials choose, by the number."""
-    ours = learned.detectors(stride_ms / windows.length_ms)
+    ours = learned.detectors(stride_ms / settings.windows.length_ms)
     return {
-        "smoothing": {settings.smoothing: Smoothing(settings.smoothing)},
-        "smoothing chosen": {width: Smoothing(width) for width in settings.smoothing_grid},
+        "smoothing": {detection.smoothing: Smoothing(detection.smoothing)},
+        "smoothing chosen": {width: Smoothing(width) for width in detection.smoothing_grid},
         **{name: {0: detector} for name, detector in ours.items()},
     }
 

@@ -17,12 +17,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
 from sliplab.analysis.detectors.onset_references import References
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
+from sliplab.analysis.networks import baselines
+from sliplab.analysis.networks.baselines import Logistic
 from sliplab.storage.kernels import njit
 
 FloatArray = npt.NDArray[np.float64]
@@ -33,9 +34,6 @@ RULE = "rule, "
 """Beginning of the name of a network's rule of detection among detectors."""
 ADDED = 0.5
 """Windows added to each bin of a histogram (Krichevsky and Trofimov, 1981): no bin stays empty."""
-
-RIDGE = 1e-3
-"""L2 penalty of the regression on standardised weights, per mean log likelihood."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -261,24 +259,19 @@ def fit_histograms(
 
 @dataclass(frozen=True)
 class BalancedLogistic:
-    """Multinomial logistic regression with all classes weighing the same.
+    """Multinomial logistic regression with all classes weighing the same."""
 
-    Attributes:
-        weights: float64 (1 + k, classes), the first row the offsets.
-        mean, scale: float64 (k,), of the features over the training windows.
-    """
-
-    weights: FloatArray
-    mean: FloatArray
-    scale: FloatArray
+    fitted: Logistic
 
     def log(self, features: Array) -> FloatArray:
         """Return the same as `Likelihood.log`."""
-        scaled = (np.asarray(features, np.float64) - self.mean) / self.scale
+        fitted = self.fitted
+        scaled = (np.asarray(features, np.float64) - fitted.mean) / fitted.scale
         # not a matrix product, whose rounding depends on how many windows there are: a detector
         # a window's output must not depend on later windows
-        linear = np.broadcast_to(self.weights[0], (len(scaled), len(self.weights[0]))).copy()
-        for column, weights in zip(scaled.T, self.weights[1:], strict=True):
+        offsets = fitted.weights[0]
+        linear = np.broadcast_to(offsets, (len(scaled), len(offsets))).copy()
+        for column, weights in zip(scaled.T, fitted.weights[1:], strict=True):
             linear += column[:, None] * weights
         return np.asarray(log_softmax(linear, axis=1))
 
@@ -286,10 +279,7 @@ class BalancedLogistic:
 def fit_logistic(
     features: Array, labels: npt.NDArray[np.integer], classes: int
 ) -> BalancedLogistic:
-    """The regression, by L-BFGS from zero: convex, so the result repeats.
-
-    Minimises the cross-entropy, averaged within each class that has windows and then over these,
-    + `RIDGE` / 2 times the squared weights (not the offsets). It is blind to the classes' order.
+    """The regression; it is blind to the classes' order.
 
     Args:
         features: (n, k), finite; a constant one gets no weight.
@@ -300,28 +290,10 @@ def fit_logistic(
     """
     labels = _check(features, labels, classes)
     raw = np.asarray(features, np.float64)
-    if not len(raw):
-        empty = np.zeros(raw.shape[1])
-        return BalancedLogistic(np.zeros((1 + raw.shape[1], classes)), empty, empty + 1)
-    mean, spread = raw.mean(axis=0), raw.std(axis=0)
-    scale = np.where(spread > 0, spread, 1.0)
-    x = np.concatenate([np.ones((len(raw), 1)), (raw - mean) / scale], axis=1)
-    each = np.bincount(labels, minlength=classes)
-    share = 1.0 / (each[labels] * (each > 0).sum())
-    target = np.eye(classes)[labels] * share[:, None]
-    shape = (x.shape[1], classes)
-    penalty = np.full(shape, RIDGE)
-    penalty[0] = 0.0
-
-    def objective(flat: FloatArray) -> tuple[float, FloatArray]:
-        w = flat.reshape(shape)
-        log_p = log_softmax(x @ w, axis=1)
-        loss = -(target * log_p).sum() + 0.5 * (penalty * w * w).sum()
-        gradient = x.T @ (np.exp(log_p) * share[:, None] - target) + penalty * w
-        return float(loss), gradient.ravel()
-
-    found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
-    return BalancedLogistic(np.asarray(found.x).reshape(shape), mean, scale)
+    if len(raw):
+        return BalancedLogistic(baselines.fit_logistic(raw, labels, classes, balanced=True))
+    empty = np.zeros(raw.shape[1])
+    return BalancedLogistic(Logistic(np.zeros((1 + raw.shape[1], classes)), empty, empty + 1, 0))
 
 
 def _check(features: Array, labels: npt.NDArray[np.integer], classes: int) -> npt.NDArray[np.int64]:

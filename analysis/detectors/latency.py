@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -208,19 +208,7 @@ def median_span(
     return low, high
 
 
-class LatencyStatistics(TypedDict):
-    """Statistics of n values; None where one cannot be computed."""
-
-    mean: float | None
-    std: float | None
-    median: float | None
-    p95: float | None
-    min: float | None
-    max: float | None
-    n: int
-
-
-def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> LatencyStatistics:
+def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> dict[str, Any]:
     """Statistics of the values that are there; None where one cannot be computed.
 
     ``std`` is the sample standard deviation (divisor n - 1), so it needs two values; percentiles
@@ -232,9 +220,7 @@ def _describe(values: Sequence[float | None], lost: int, lost_ms: float) -> Late
     there = np.array([v for v in values if v is not None], np.float64)
     n = len(there)
     if n == 0:
-        return LatencyStatistics(
-            mean=None, std=None, median=None, p95=None, min=None, max=None, n=0
-        )
+        return {**dict.fromkeys(("mean", "std", "median", "p95", "min", "max")), "n": 0}
     return {
         "mean": float(there.mean()),
         "std": float(there.std(ddof=1)) if n > 1 else None,

@@ -184,11 +184,6 @@ class NetworkDetector(StreamDetector):
         """End of the last window that was evaluated, or start of the first one after a gap."""
         return self._settled_us
 
-    @property
-    def open_windows(self) -> int:
-        """Number of open windows: the memory does not grow with time."""
-        return len(self._open)
-
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         """See `StreamDetector`. Raises ValueError for an event outside the sensor."""
         last_us = int(events.t_us[-1]) if len(events) else None

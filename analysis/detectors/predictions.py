@@ -17,10 +17,9 @@ import numpy.typing as npt
 
 from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.baselines import step_sums
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
-from sliplab.analysis.windows.samples import strided_windows
-from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import Json
@@ -38,17 +37,25 @@ def seed_step(seed: int) -> str:
 
 
 @dataclass(frozen=True)
-class _Counting:
-    """Inputs of spike counts besides the trial.
+class _Inference:
+    """Inputs of a trial's spikes besides the trial.
 
     Attributes:
         threads: of the network; None for as many as there are cores.
         stride_ms: of the windows; None for consecutive ones.
+        stateful: neurons keep their states from each window to the next.
     """
 
     model: bytes
     threads: int | None
     stride_ms: int | None
+    stateful: bool = False
+
+    def network(self) -> training.Fitted:
+        """Return the network, in so many threads of this process."""
+        if self.threads is not None:
+            training.limit_threads(self.threads)
+        return _fitted(self.model)
 
 
 def count_spikes(
@@ -72,19 +79,17 @@ def count_spikes(
     Returns:
         how many trials were counted.
     """
-    counting = _Counting(model.read_bytes(), threads, stride_ms)
-    required = [TrialWork(recording, name, key, counting) for name, recording, key in trials]
+    inference = _Inference(model.read_bytes(), threads, stride_ms)
+    required = [TrialWork(recording, name, key, inference) for name, recording, key in trials]
     work = stale_trials(store, step, required)
     if work:
         keep(step, work, _count)
     return len(work)
 
 
-def _count(recording: Recording, counting: _Counting) -> tuple[Json, Arrays]:
+def _count(recording: Recording, inference: _Inference) -> tuple[Json, Arrays]:
     """Spike counts of all windows of a trial."""
-    if counting.threads is not None:
-        training.limit_threads(counting.threads)
-    counts, end_ns = window_counts(recording, _fitted(counting.model), counting.stride_ms)
+    counts, end_ns = window_counts(recording, inference.network(), inference.stride_ms)
     return {}, {"counts": counts, "end_ns": end_ns}
 
 
@@ -96,21 +101,8 @@ def window_counts(
     Args:
         stride_ms: of the windows; None for consecutive ones.
     """
-    if stride_ms is None:
-        x, end_ns = dataset.trial_windows(recording, fitted.windows)
-    else:
-        x, end_ns = _strided(recording, fitted.windows, stride_ms)
+    x, end_ns = dataset.trial_windows(recording, fitted.windows, stride_ms)
     return training.predict_counts(fitted, x), end_ns
-
-
-def _strided(
-    recording: Recording, windows: Windows, stride_ms: int
-) -> tuple[SparseWindows, npt.NDArray[np.int64]]:
-    """Return windows at a stride, and where they end, ns."""
-    length_ns = windows.length_ms * 1_000_000
-    span = dataset.recorded_span(recording)
-    starts = strided_windows(*span, length_ns, stride_ms * 1_000_000)
-    return dataset.cut_windows(recording, starts, windows), starts + length_ns
 
 
 PREDICTIONS = "heard"
@@ -158,21 +150,9 @@ def prediction_request(
     return PredictionRequest(campaign, recording, stride_ms, stateful, key)
 
 
-@dataclass(frozen=True)
-class _Inference:
-    """Inputs of inference besides the trial; `threads` of the network, None for all."""
-
-    model: bytes
-    windows: Windows
-    stride_ms: int
-    stateful: bool
-    threads: int | None
-
-
 def predict_trials(
     store: Store,
     model: Path,
-    windows: Windows,
     requests: Sequence[PredictionRequest],
     keep: KeepTrials,
     threads: int | None = None,
@@ -192,7 +172,7 @@ def predict_trials(
                     item.recording,
                     item.campaign,
                     item.key,
-                    _Inference(content, windows, item.stride_ms, item.stateful, threads),
+                    _Inference(content, threads, item.stride_ms, item.stateful),
                 )
                 for item in requests
                 if item.step == step
@@ -210,34 +190,30 @@ def predictions(store: Store, request: PredictionRequest) -> Arrays:
 
 
 def _infer(recording: Recording, inference: _Inference) -> tuple[Json, Arrays]:
-    if inference.threads is not None:
-        training.limit_threads(inference.threads)
-    fitted = _fitted(inference.model)
-    return {}, _stateful(recording, inference, fitted) if inference.stateful else _stateless(
-        recording, inference, fitted
-    )
+    """Spikes and events of all windows of a trial."""
+    fitted, stride_ms = inference.network(), inference.stride_ms
+    if inference.stateful and stride_ms is not None:
+        return {}, _stateful(recording, fitted, stride_ms)
+    x, end_ns = dataset.trial_windows(recording, fitted.windows, stride_ms)
+    return {}, {
+        "counts": training.predict_counts(fitted, x),
+        "events": x.totals,
+        "end_ns": end_ns,
+    }
 
 
-def _stateless(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:
-    """Run inference with states reset at every window."""
-    x, end_ns = _strided(recording, inference.windows, inference.stride_ms)
-    return {"counts": training.predict_counts(fitted, x), "events": x.totals, "end_ns": end_ns}
-
-
-def _stateful(recording: Recording, inference: _Inference, fitted: training.Fitted) -> Arrays:
+def _stateful(recording: Recording, fitted: training.Fitted, stride_ms: int) -> Arrays:
     """Run inference once through the trial; windows are trailing sums of its spikes."""
-    windows = inference.windows
+    windows = fitted.windows
     x, ends = dataset.trial_windows(recording, windows)
     spikes = stateful_spikes(fitted.engine, x)
-    running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
-    events = np.diff(running[x.offsets])
-    length, stride = windows.steps, inference.stride_ms // windows.step_ms
+    length, stride = windows.steps, stride_ms // windows.step_ms
     counts = trailing_sums(spikes, length, stride)
     first = int(ends[0]) if len(ends) else 0
     return {
         "counts": counts,
-        "events": trailing_sums(events[:, None], length, stride)[:, 0],
-        "end_ns": first + np.arange(len(counts), dtype=np.int64) * inference.stride_ms * 1_000_000,
+        "events": trailing_sums(step_sums(x).reshape(-1, 1), length, stride)[:, 0],
+        "end_ns": first + np.arange(len(counts), dtype=np.int64) * stride_ms * 1_000_000,
     }
 
 

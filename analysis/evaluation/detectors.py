@@ -25,8 +25,7 @@ from sliplab.analysis.detectors.rule_sweep import SpikeCounts, choose_smoothing
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.protocols.windows import Windows
-from sliplab.storage.schema.evaluation import AlarmRate, DetectorComparison, RuleChoice
+from sliplab.storage.schema.evaluation import DetectorComparison, RuleChoice
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -39,20 +38,6 @@ class KnownTrial:
     label: str
     slip: TrueSlip
     references: References
-
-
-@dataclass(frozen=True)
-class PromisedRow:
-    """A detector at the level that a promise set, with its test figures.
-
-    Attributes:
-        test: false alarms on test trials; None without any.
-        median_ms: incipient latency on them, a missed one infinite; None if so.
-    """
-
-    found: PromisedRule
-    test: AlarmRate | None
-    median_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -120,42 +105,18 @@ class DetectorWork:
         Args:
             settings: windows and strides; detection: the paper's rule.
         """
-        tuning = self._tuning(store, settings, detection)
-        return [] if tuning is None else tuned(*tuning)
+        return tuned(_parts(store, self.compared), settings, detection)
 
     def promise(
         self, store: Store, settings: AnalysisSettings, detection: Detection, rate: float
-    ) -> list[PromisedRow]:
+    ) -> list[PromisedRule]:
         """Return the same detectors at the levels that promise a rate, with their test figures.
 
         Args:
             settings, detection: as `tune`.
             rate: false alarms an hour without slip, at most.
         """
-        tuning = self._tuning(store, settings, detection)
-        if tuning is None:
-            return []
-        tolerance, test = round(detection.false_early_ms * 1e6), tuning[0].test
-        return [
-            PromisedRow(
-                found,
-                found.rate_on(test, tolerance) if test else None,
-                found.median_ms(test, tolerance),
-            )
-            for found in promised(*tuning, rate)
-        ]
-
-    def _tuning(
-        self, store: Store, settings: AnalysisSettings, detection: Detection
-    ) -> tuple[Parts, Windows, Detection, int, int, float] | None:
-        fine, asked = settings.fine_stride_ms, detection.compare
-        parts = _parts(store, self.compared)
-        if parts is None or fine is None or asked is None:
-            return None
-        if not (parts.train and parts.validation):
-            return None
-        rate = asked.rates[len(asked.rates) // 2]
-        return parts, settings.windows, detection, fine, settings.most_spikes, rate
+        return promised(_parts(store, self.compared), settings, detection, rate)
 
     def compare(
         self, store: Store, settings: AnalysisSettings, detection: Detection
@@ -165,17 +126,11 @@ class DetectorWork:
         Args:
             settings: windows and strides; detection: the paper's rule.
         """
-        fine = settings.fine_stride_ms
-        parts = _parts(store, self.compared)
-        if parts is None or fine is None:
-            return None
-        found = compare(parts, settings.windows, detection, fine, settings.most_spikes)
-        stateful_parts = _parts(store, self.stateful)
-        if found is None or stateful_parts is None:
+        found = compare(_parts(store, self.compared), settings, detection)
+        if found is None or self.stateful is None:
             return found
-        stateful = compare(stateful_parts, settings.windows, detection, fine, settings.most_spikes)
-        ours = () if stateful is None else stateful.detectors
-        return found.model_copy(update={"carried": ours})
+        stateful = compare(_parts(store, self.stateful), settings, detection)
+        return found.model_copy(update={"carried": () if stateful is None else stateful.detectors})
 
 
 def detector_work(
@@ -245,11 +200,10 @@ def detector_work(
     return DetectorWork(scored, choosing, compared(False), compared(True))
 
 
-def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts | None:
-    """The trials of a comparison, read; None without one."""
-    if known is None:
-        return None
-    return Parts(**{name: [_labelled(store, t) for t in trials] for name, trials in known.items()})
+def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts:
+    """The trials of a comparison, read; no trials without one."""
+    names = ("train", "validation", "test")
+    return Parts(*([_labelled(store, t) for t in (known or {}).get(name, ())] for name in names))
 
 
 def _labelled(store: Store, trial: KnownTrial) -> TrialWithSlip:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Literal, TypedDict
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -165,23 +165,20 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
     )
 
 
-class NetworkOrigin(TypedDict):
-    """Origin of a network: preset and seed of a training; None where a file brought it."""
-
-    preset: str | None
-    seed: int | None
-
-
 @dataclass(frozen=True)
 class Judgement:
-    """A network, and the trials and rules of its evaluation, found before anything is computed."""
+    """A network, and the trials and rules of its evaluation, found before anything is computed.
+
+    Attributes:
+        about: preset and seed of its training; None where a file brought it.
+    """
 
     store: Store
     campaigns: list[Collected]
     labels: StoreLabels
     network: OtherNetwork
     rules: dict[str, Detection]
-    about: NetworkOrigin
+    about: dict[str, Any]
 
     @property
     def data_key(self) -> str:
@@ -256,7 +253,7 @@ def file_judgement(
         name: Detection.model_validate({**rule.model_dump(), **change, "compare": None})
         for name, rule in rules_of(campaigns, network.outputs_per_class).items()
     }
-    about = NetworkOrigin(preset=None, seed=None)
+    about = {"preset": None, "seed": None}
     return Judgement(labels.store, campaigns, labels, network, rules, about)
 
 
@@ -287,7 +284,7 @@ def comparison_judgements(labels: StoreLabels, campaigns: list[Collected]) -> li
             )
             for item in campaigns
         }
-        about = NetworkOrigin(preset=settings.preset, seed=model.seed)
+        about = {"preset": settings.preset, "seed": model.seed}
         found.append(Judgement(labels.store, campaigns, labels, network, rules, about))
     return found
 
@@ -331,11 +328,8 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     if judging.threads is not None:
         training.limit_threads(judging.threads)
     counts = _counter(network.content, network.description, network.engine)
-    starts = dataset.run_starts(recording, network.windows, judging.stride_ms)
-    found = {
-        "counts": counts(dataset.cut_windows(recording, starts, network.windows)),
-        "end_ns": starts + network.windows.length_ms * 1_000_000,
-    }
+    windows, end_ns = dataset.trial_windows(recording, network.windows, judging.stride_ms)
+    found = {"counts": counts(windows), "end_ns": end_ns}
     if judging.label is not None:
         trial = dataset.TrialId(recording.folder.parents[1].name, recording.folder.name)
         samples = dataset.trial_samples(

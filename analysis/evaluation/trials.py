@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +23,6 @@ from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.networks import training
-from sliplab.analysis.networks.models import rules_of
-from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_net
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import load_samples
@@ -32,9 +30,7 @@ from sliplab.protocols import Trial
 from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import (
     AlarmRate,
-    ExperimentLatency,
     ExperimentScores,
-    Latencies,
     SeedTimes,
     TrialLatency,
     TrialScore,
@@ -148,45 +144,6 @@ def quiet_alarms(trials: Iterable[tuple[TrialScore, Recording]]) -> AlarmRate | 
             alarms.append(int(false))
             hours.append(time / 3.6e12)
     return alarm_rate(alarms, hours) if hours else None
-
-
-def latencies(
-    campaigns: list[Collected],
-    labels: StoreLabels,
-    fitted: Fitted,
-    whole: Quantised,
-    on_trial: Callable[[], None] = lambda: None,
-) -> tuple[Latencies, Latencies]:
-    """Latency over the test trials of `campaigns`, as trained and with the whole numbers.
-
-    Args:
-        on_trial: called before each of them; some thousand windows take a second.
-    """
-    rules = rules_of(campaigns, fitted.network.outputs_per_class)
-    fast, chip = fitted.engine, quantised_net(fitted, whole)
-    found: tuple[dict[str, list[TrialLatency]], ...] = ({}, {})
-    for item in campaigns:
-        rule = rules[item.name]
-        for _, recording in item.of_split("test"):
-            on_trial()
-            slip = true_slip(labels.read(item, recording))
-            if slip is None:
-                continue
-            x, end_ns = dataset.trial_windows(recording, fitted.windows)
-            both = fast.counts(x), chip_run(chip, x.dense()).counts
-            for rows, counts in zip(found, both, strict=True):
-                stated = detect(counts, end_ns, rule)
-                scored = score_trial(stated, slip, round(rule.false_early_ms * 1e6))
-                rows.setdefault(item.experiment, []).append(scored)
-    real, chips = map(_summary, found)
-    return real, chips
-
-
-def _summary(rows: dict[str, list[TrialLatency]]) -> Latencies:
-    return {
-        experiment: ExperimentLatency(trials=len(each), latency_ms=summarise_latency(each))
-        for experiment, each in rows.items()
-    }
 
 
 @dataclass(frozen=True)

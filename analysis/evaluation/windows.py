@@ -18,7 +18,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
-from sliplab.analysis.networks.baselines import evaluate_baselines
+from sliplab.analysis.networks.baselines import cheap_votes
 from sliplab.analysis.networks.models import ModelOnDisk, training_settings
 from sliplab.analysis.windows.dataset import SampleSet, recorded_span
 from sliplab.analysis.windows.sample_sets import (
@@ -83,7 +83,7 @@ def score_windows(
             "trials": np.array(test.trials, np.str_).reshape(-1, 2),
         },
     )
-    cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
+    cheap = cheap_votes(train.windows, train.y, test.windows)
     middle = test.start_ns + settings.windows.length_ms * 500_000
     by_tenth, no_slip = phases(labels, known, middle, test.y, trial, hits)
     return WindowScores(
@@ -110,10 +110,8 @@ def score_windows(
             lambda model: training.predict_counts(model_file.load(model.path), test.windows),
         ),
         work=synaptic.count_work(fitted, test.windows),
-        baselines={name: score.argmax for name, score in cheap.items()},
-        beside={
-            name: compared(score.votes, counts, test.y, trial) for name, score in cheap.items()
-        },
+        baselines={name: metrics.accuracy(votes, test.y).argmax for name, votes in cheap.items()},
+        beside={name: compared(votes, counts, test.y, trial) for name, votes in cheap.items()},
         samples=SampleCounts(train=len(train), test=len(test)),
     )
 

@@ -42,14 +42,8 @@ class Blobs:
     roundness: Floats
 
 
-def otsu_threshold(frame: Frame) -> int:
-    """The grey level that best parts a frame into dark and bright (Otsu 1979)."""
-    return int(cv2.threshold(frame, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0])
-
-
 def find_blobs(
     frame: Frame,
-    threshold: int | None = None,
     min_area_px: float = 50.0,
     max_area_px: float = 20_000.0,
     min_roundness: float = 0.965,
@@ -61,7 +55,6 @@ def find_blobs(
 
     Args:
         frame: (h, w) uint8.
-        threshold: a pixel belongs to a blob when it is brighter; Otsu's by default.
         min_area_px, max_area_px: bounds on the number of pixels.
         min_roundness: blobs less round are left out. A blob cut by the frame's edge mostly is.
 
@@ -69,8 +62,8 @@ def find_blobs(
         TypeError: the frame is not 2-D uint8.
     """
     frame = checked_frame(frame)
-    level = otsu_threshold(frame) if threshold is None else threshold
-    binary = cv2.threshold(frame, level, 1, cv2.THRESH_BINARY)[1]
+    # the grey level that best parts the frame into dark and bright (Otsu 1979)
+    level, binary = cv2.threshold(frame, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4, ltype=cv2.CV_16U)
     found: list[tuple[float, float, float, float]] = []
     for label in range(1, len(stats)):
@@ -78,7 +71,7 @@ def find_blobs(
         if not (min_area_px <= area <= max_area_px and 0.6 < width / height < 1.67):
             continue
         box = np.s_[top : top + height, left : left + width]
-        moments = _moments(frame[box], labels[box], label, level)
+        moments = _moments(frame[box], labels[box], label, int(level))
         if moments[3] >= min_roundness:
             found.append((moments[0] + left, moments[1] + top, float(area), moments[3]))
     table = np.array(found, np.float64).reshape(-1, 4)

@@ -8,13 +8,11 @@ markers were at rest to measure it, and where a marker slipped in the hold.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, paper_onsets
-from sliplab.protocols.labelling import Labelling
+from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets
+from sliplab.storage.schema.label import KINDS, OnsetDoubts
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,27 +24,10 @@ MAX_OFF_FRAMES = 2
 _SIGMAS = 3.0
 
 
-@dataclass(frozen=True)
-class Doubts:
-    """Reasons why a trial's onsets are ambiguous, as text; None where an onset is known."""
-
-    incipient: str | None
-    gross: str | None
-
-    def or_else(self, other: Doubts) -> Doubts:
-        """Return these doubts, and the other's for an onset without one."""
-        return Doubts(self.incipient or other.incipient, self.gross or other.gross)
-
-
-NO_DOUBTS = Doubts(None, None)
-
-
-def doubts(
-    frame_ns: Ints, displacement: Floats, centre: int, settings: Labelling, not_before_ns: int
-) -> Doubts:
-    """`unseen` for the paper's rule; arguments and errors as for `paper_onsets`."""
-    onsets = paper_onsets(frame_ns, displacement, centre, settings, not_before_ns)
-    return unseen(frame_ns, displacement, onsets, centre, not_before_ns)
+def first_doubts(*doubts: OnsetDoubts) -> OnsetDoubts:
+    """Return the first doubt about each onset."""
+    first = {kind: next(filter(None, (each.of(kind) for each in doubts)), None) for kind in KINDS}
+    return OnsetDoubts(**first)
 
 
 def unseen(
@@ -56,7 +37,7 @@ def unseen(
     centre: int,
     not_before_ns: int,
     motion_ns: int | None = None,
-) -> Doubts:
+) -> OnsetDoubts:
     """Return the onsets that hidden, lost or never seen markers could have changed.
 
     A marker that is out of sight and comes back where it was has not slipped; one that comes back
@@ -72,7 +53,7 @@ def unseen(
     """
     origin_ns = not_before_ns if motion_ns is None else motion_ns
     if not len(frame_ns):
-        return NO_DOUBTS
+        return OnsetDoubts()
     last_ns = int(frame_ns[-1])
     incipient = last_ns if onsets.incipient_ns is None else onsets.incipient_ns
     found: list[tuple[int, int]] = []
@@ -92,13 +73,13 @@ def unseen(
         if min(until, incipient) - seen > MAX_UNSEEN_NS:
             found.append((seen, marker))
     if not found:
-        return Doubts(None, gross)
+        return OnsetDoubts(gross=gross)
     seen, marker = min(found)
     reason = (
         f"marker {marker} could not be followed from {_s(seen - origin_ns)} after the motion "
         "began, and may have slipped first"
     )
-    return Doubts(reason, gross)
+    return OnsetDoubts(incipient=reason, gross=gross)
 
 
 def uncertain(
@@ -109,7 +90,7 @@ def uncertain(
     centre: int,
     threshold_px: float,
     not_before_ns: int,
-) -> Doubts:
+) -> OnsetDoubts:
     """Return the onsets whose threshold crossing the standard deviations leave ambiguous.
 
     Args:
@@ -129,10 +110,10 @@ def uncertain(
     if last - first > 2 * MAX_OFF_FRAMES:
         marker = int(earliest.argmin())
         incipient = f"marker {marker}'s place is only known to {_worst(sigma, marker)} px"
-    return Doubts(incipient, gross)
+    return OnsetDoubts(incipient=incipient, gross=gross)
 
 
-def slipped_in_hold(hold_slip_px: Floats, limit_px: float | None) -> Doubts:
+def slipped_in_hold(hold_slip_px: Floats, limit_px: float | None) -> OnsetDoubts:
     """Return doubts of both onsets where a marker moved too far during the hold.
 
     Args:
@@ -141,10 +122,10 @@ def slipped_in_hold(hold_slip_px: Floats, limit_px: float | None) -> Doubts:
     """
     known = np.nan_to_num(hold_slip_px)
     if limit_px is None or not (known > limit_px).any():
-        return NO_DOUBTS
+        return OnsetDoubts()
     marker = int(known.argmax())
     reason = f"marker {marker} moved by {known[marker]:.1f} px in the hold, before the motion"
-    return Doubts(reason, reason)
+    return OnsetDoubts(incipient=reason, gross=reason)
 
 
 def _worst(sigma: Floats, marker: int) -> str:

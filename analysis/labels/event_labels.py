@@ -7,14 +7,12 @@ threshold means what it means in frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sliplab.analysis.labels.doubts import Doubts, slipped_in_hold, unseen
+from sliplab.analysis.labels.camera_shift import no_shift
+from sliplab.analysis.labels.doubts import first_doubts, slipped_in_hold, unseen
 from sliplab.analysis.labels.event_slips import AT_REST_MM, PapillaSlips, slips
 from sliplab.analysis.labels.event_tracking import (
     EventTracks,
@@ -22,9 +20,13 @@ from sliplab.analysis.labels.event_tracking import (
     track_discs,
     without_hot_pixels,
 )
+from sliplab.analysis.labels.force_onsets import onsets_by_force
+from sliplab.analysis.labels.label import HoldEndOnsets, Label
 from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets, last_off_axis, paper_onsets
+from sliplab.analysis.labels.places import Places
 from sliplab.analysis.labels.slip_times import SlipTimes
 from sliplab.protocols.labelling import Labelling
+from sliplab.storage.schema.label import OnsetDoubts, OnsetIntervals
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
 
@@ -47,49 +49,16 @@ PHASES = ("slide", "twist")
 NO_PLATE = "the plate moves by itself, and the event camera does not see it"
 NO_DISCS = "the markers were not found in the events of the first motion"
 TURNED = "the sensor turned back on its way"
+SOURCE = "events"
+"""The source of these labels."""
 
 
-class Interval(NamedTuple):
-    """The central 95 % of an onset, ns."""
-
-    low_ns: int
-    high_ns: int
-
-    @property
-    def width_ns(self) -> int:
-        """Its width."""
-        return self.high_ns - self.low_ns
-
-
-@dataclass(frozen=True)
-class EventOnsets:
-    """Onsets of one trial by its events.
-
-    Attributes:
-        t_ns: (n,) ends of the slices on the time line.
-        displacement_px: (n, m) from rest, NaN where unknown. sigma_px: likewise, its deviation.
-        hold_slip_px: (m,) displacement in the hold.
-        paper: by the paper's rule, with its doubts and the 95 % of either onset.
-        slips: beginning of each slip, with doubts.
-        tracks: of the markers in the inner picture; None where they were not found.
-    """
-
-    t_ns: I64
-    displacement_px: F64
-    sigma_px: F64
-    hold_slip_px: F64
-    paper: LabelOnsets
-    paper_doubts: Doubts
-    intervals: tuple[Interval | None, Interval | None]
-    slips: SlipTimes
-    slip_doubts: Doubts
-    tracks: EventTracks | None
-
-
-def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
+def onsets_by_events(recording: Recording, settings: Labelling) -> Label:
     """Find the onsets of a trial.
 
-    A trial that cannot be labelled so has onsets in doubt, and the reason.
+    Its displacements are given at the ends of slices of time, and its places are those in the
+    picture of the event camera. A trial that cannot be labelled so has onsets in doubt, and the
+    reason.
 
     Raises:
         StoreError: it has no events, or the scale of the frame camera is unknown.
@@ -102,22 +71,21 @@ def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
     # slices end where the motion begins and go on from there
     before = max((start_ns - begin_ns) // SLICE_NS, 1)
     edges_ns = start_ns + SLICE_NS * np.arange(-before, (stop_ns - start_ns) // SLICE_NS + 1)
-    centre = recording.record.geometry.centre
-    layout_px, scale = recording.layout_px, recording.record.geometry.px_per_mm or 1.0
-    layout_mm = layout_px / scale
+    t_ns = edges_ns[1:]
+    layout_mm = recording.layout_px / (recording.record.geometry.px_per_mm or 1.0)
     if recording.motion_phase not in PHASES or recording.record.experiment != "kinematic":
-        return _refused(edges_ns[1:], len(layout_mm), centre, NO_PLATE)
-    base = bases(recording, layout_mm, edges_ns[1:], start_ns)
+        return _refused(recording, settings, t_ns, NO_PLATE)
+    base = bases(recording, layout_mm, t_ns, start_ns)
     way = np.hypot(base[..., 0], base[..., 1])
     if (np.maximum.accumulate(way) - way).max() > TURNED_BACK_MM:
-        return _refused(edges_ns[1:], len(layout_mm), centre, TURNED)
+        return _refused(recording, settings, t_ns, TURNED)
     farthest = way.max(axis=1)
     settle = slice(int(before), int(np.searchsorted(farthest, FIRST_MM)) + 1)
     edges_us = np.asarray(clock.to_device(edges_ns)) // 1000
     first = _between(events, int(edges_us[settle.start]), int(edges_us[settle.stop]))
     discs = find_discs(first, layout_mm, size_px)
     if discs is None:
-        return _refused(edges_ns[1:], len(layout_mm), centre, NO_DISCS)
+        return _refused(recording, settings, t_ns, NO_DISCS)
     tracks = track_discs(events, edges_us, discs, settle)
     along = _directions(base, way)
     moved = ((tracks.xy - tracks.rests.xy) * along).sum(axis=2)
@@ -125,18 +93,7 @@ def onsets_by_events(recording: Recording, settings: Labelling) -> EventOnsets:
     moved[:, way.max(axis=0) < AT_REST_MM] = 0.0
     moved[tracks.lost] = np.nan
     found = slips(way, moved, tracks.sigma, int(before), tracks.backlash_px)
-    return _onsets(
-        found,
-        tracks,
-        edges_ns[1:],
-        way,
-        moved,
-        settings,
-        scale,
-        centre,
-        start_ns,
-        twists=recording.motion_phase == "twist",
-    )
+    return _onsets(recording, settings, t_ns, found, tracks, way, moved)
 
 
 def bases(recording: Recording, layout_mm: F64, t_ns: I64, start_ns: int) -> F64:
@@ -189,23 +146,21 @@ def _directions(base: F64, way: F64) -> F64:
 
 
 def _onsets(
+    recording: Recording,
+    settings: Labelling,
+    t_ns: I64,
     found: PapillaSlips,
     tracks: EventTracks,
-    t_ns: I64,
     way: F64,
     moved: F64,
-    settings: Labelling,
-    scale: float,
-    centre: int,
-    start_ns: int,
-    *,
-    twists: bool,
-) -> EventOnsets:
+) -> Label:
     """Apply both rules to the slips."""
+    start_ns, geometry = recording.motion_ns[0], recording.record.geometry
+    centre, scale = geometry.centre, geometry.px_per_mm or 1.0
     moved_px, sigma = np.abs(found.distance_mm) * scale, found.sigma_mm * scale
     still = int(np.searchsorted(t_ns, start_ns))
     hold = np.abs(moved[max(still, 1) - 1] - moved[0]) / found.gain * scale
-    if twists:
+    if recording.motion_phase == "twist":
         centre = last_off_axis(paper_onsets(t_ns, moved_px, centre, settings, start_ns), centre)
     paper = paper_onsets(t_ns, moved_px, centre, settings, start_ns)
     times = [
@@ -217,28 +172,28 @@ def _onsets(
     crept = paper.per_marker_ns == NO_ONSET
     low, at, high = (np.where(crept, NO_ONSET, column) for column in (low, at, high))
     slip_times = SlipTimes(at, low, high, centre, WIDEST_NS // 2)
+    known = np.isfinite(moved_px)
+    xy = np.where(known[..., None], tracks.xy, np.nan)
     held = slipped_in_hold(hold, settings.hold_slip_px)
     lost_ns = t_ns[tracks.lost & (t_ns > start_ns)]
     intervals = crossing_intervals(
         t_ns, moved_px, sigma, paper, centre, settings.threshold_px, start_ns
     )
 
-    def doubts(onsets: LabelOnsets) -> Doubts:
-        return held.or_else(unseen(t_ns, moved_px, onsets, centre, start_ns)).or_else(
-            _near_lost(onsets, lost_ns)
-        )
+    def doubts(onsets: LabelOnsets) -> OnsetDoubts:
+        hidden = unseen(t_ns, moved_px, onsets, centre, start_ns)
+        return first_doubts(held, hidden, _near_lost(onsets, lost_ns))
 
-    return EventOnsets(
+    return _label(
+        recording,
+        settings,
         t_ns,
-        moved_px,
-        sigma,
-        hold,
-        paper,
-        doubts(paper).or_else(_wide(intervals)),
+        HoldEndOnsets(paper, first_doubts(doubts(paper), _wide(intervals)), moved_px),
         intervals,
         slip_times,
-        doubts(slip_times.onsets).or_else(slip_times.doubts()),
-        tracks,
+        first_doubts(doubts(slip_times.onsets), slip_times.doubts()),
+        hold,
+        Places(xy, sigma, known.astype(np.float64)),
     )
 
 
@@ -261,7 +216,7 @@ def crossing_intervals(
     centre: int,
     threshold_px: float,
     start_ns: int,
-) -> tuple[Interval | None, Interval | None]:
+) -> OnsetIntervals:
     """Return when the displacements, give or take two deviations, cross the threshold.
 
     Args:
@@ -280,46 +235,77 @@ def crossing_intervals(
     crosses = paper.per_marker_ns != NO_ONSET
     incipient = gross = None
     if paper.incipient_ns is not None:
-        incipient = Interval(int(t_ns[may[crosses].min()]), int(t_ns[must[crosses].min()]))
+        incipient = int(t_ns[may[crosses].min()]), int(t_ns[must[crosses].min()])
     if paper.gross_ns is not None:
-        gross = Interval(int(t_ns[may[centre]]), int(t_ns[must[centre]]))
-    return incipient, gross
+        gross = int(t_ns[may[centre]]), int(t_ns[must[centre]])
+    return OnsetIntervals(incipient_ns=incipient, gross_ns=gross)
 
 
-def _wide(intervals: tuple[Interval | None, Interval | None]) -> Doubts:
-    reasons = [
-        f"the crossing is only known to {known.width_ns / 1e6:.0f} ms"
-        if known is not None and known.width_ns > WIDEST_NS
-        else None
-        for known in intervals
-    ]
-    return Doubts(*reasons)
+def _wide(intervals: OnsetIntervals) -> OnsetDoubts:
+    def of(known: tuple[int, int] | None) -> str | None:
+        width_ns = 0 if known is None else known[1] - known[0]
+        wide = width_ns > WIDEST_NS
+        return f"the crossing is only known to {width_ns / 1e6:.0f} ms" if wide else None
+
+    return OnsetDoubts(incipient=of(intervals.incipient_ns), gross=of(intervals.gross_ns))
 
 
-def _near_lost(onsets: LabelOnsets, lost_ns: I64) -> Doubts:
+def _near_lost(onsets: LabelOnsets, lost_ns: I64) -> OnsetDoubts:
     """Return doubts about onsets near lost events."""
 
     def of(onset: int | None) -> str | None:
         near = onset is not None and bool((np.abs(lost_ns - onset) < NEAR_LOST_NS).any())
         return "events were lost close to it" if near else None
 
-    return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
+    return OnsetDoubts(incipient=of(onsets.incipient_ns), gross=of(onsets.gross_ns))
 
 
-def _refused(t_ns: I64, markers: int, centre: int, reason: str) -> EventOnsets:
-    """Return the result of a trial that cannot be labelled, with the reason."""
+def _refused(recording: Recording, settings: Labelling, t_ns: I64, reason: str) -> Label:
+    """Return the label of a trial that cannot be labelled, with the reason."""
+    markers = len(recording.layout_px)
     none = np.full(markers, NO_ONSET, np.int64)
     unknown = np.full((len(t_ns), markers), np.nan)
-    doubts = Doubts(reason, reason)
-    return EventOnsets(
+    doubts = OnsetDoubts(incipient=reason, gross=reason)
+    return _label(
+        recording,
+        settings,
         t_ns,
-        unknown,
-        unknown,
+        HoldEndOnsets(LabelOnsets(None, None, None, none), doubts, unknown),
+        OnsetIntervals(incipient_ns=None, gross_ns=None),
+        SlipTimes(none, none, none, recording.record.geometry.centre),
+        doubts,
         np.full(markers, np.nan),
-        LabelOnsets(None, None, None, none),
-        doubts,
-        (None, None),
-        SlipTimes(none, none, none, centre),
-        doubts,
+        Places(np.stack([unknown, unknown], axis=2), unknown, np.zeros_like(unknown)),
+    )
+
+
+def _label(
+    recording: Recording,
+    settings: Labelling,
+    t_ns: I64,
+    counted: HoldEndOnsets,
+    intervals: OnsetIntervals,
+    slip_times: SlipTimes,
+    slip_doubts: OnsetDoubts,
+    hold_slip_px: F64,
+    places: Places,
+) -> Label:
+    start_ns, stop_ns = recording.motion_ns
+    return Label(
+        settings.rule,
+        settings.reference,
+        # nothing is seen of markers that rest: what moves in the hold is in doubt from either end
+        {"hold_start": counted, "hold_end": counted},
+        slip_times,
+        slip_doubts,
+        t_ns,
+        hold_slip_px,
+        places,
+        no_shift(len(t_ns)),
+        start_ns,
+        stop_ns,
         None,
+        SOURCE,
+        onsets_by_force(recording),
+        intervals,
     )

@@ -12,8 +12,6 @@ marker as a rule (docs/force.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sliplab.analysis.force import PlateForces, has_forces, plate_forces
@@ -30,28 +28,14 @@ FLATTER = 0.9
 """It has slackened where it is below this one."""
 
 
-@dataclass(frozen=True)
-class ForceOnsets:
-    """Onsets of one trial by its forces, on its time line; None where there is no such knee."""
-
-    incipient_ns: int | None
-    gross_ns: int | None
-    uncertainty_ns: float
-    """Of a moment of the force against the events'."""
-
-    def document(self) -> RuleOnsets:
-        """Return the part of the stored label."""
-        return RuleOnsets(incipient_ns=self.incipient_ns, gross_ns=self.gross_ns)
-
-
-def force_onsets(forces: PlateForces, start_ns: int, stop_ns: int) -> ForceOnsets:
+def force_onsets(forces: PlateForces, start_ns: int, stop_ns: int) -> RuleOnsets:
     """Find the onsets in the force during a slide.
 
     Args:
         start_ns: start of the slide on the time line; stop_ns: its end.
     """
     part = forces.between(start_ns, stop_ns)
-    none = ForceOnsets(None, None, forces.uncertainty_ns)
+    none = RuleOnsets(incipient_ns=None, gross_ns=None)
     if len(part.t_ns) < _FEWEST:
         return none
     late = part.force_n[len(part.t_ns) // 2 :, :2].mean(axis=0)
@@ -70,14 +54,13 @@ def force_onsets(forces: PlateForces, start_ns: int, stop_ns: int) -> ForceOnset
         gross_s = knee_s(t_s[after], along[after], FLAT) or gross_s
         before = t_s < gross_s
         incipient_s = knee_s(t_s[before], along[before], FLATTER)
-    return ForceOnsets(
-        None if incipient_s is None else start_ns + round(incipient_s * 1e9),
-        start_ns + round(gross_s * 1e9),
-        forces.uncertainty_ns,
+    return RuleOnsets(
+        incipient_ns=None if incipient_s is None else start_ns + round(incipient_s * 1e9),
+        gross_ns=start_ns + round(gross_s * 1e9),
     )
 
 
-def onsets_by_force(recording: Recording) -> ForceOnsets | None:
+def onsets_by_force(recording: Recording) -> RuleOnsets | None:
     """Find a trial's onsets in its forces; None without forces, or without a slide."""
     if recording.motion_phase != "slide" or not has_forces(recording):
         return None

@@ -10,7 +10,6 @@ guessed: half-hidden discs shift by more than the 2 pixels that count as slip.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -88,21 +87,19 @@ class MarkerTracker:
 
     Args:
         layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
-        threshold: grey level that parts marker and background where blobs are looked for; Otsu's
-            by default.
 
     Raises:
         ValueError: the layout is not (m, 2), or two of its markers coincide.
     """
 
-    def __init__(self, layout_px: Floats, *, threshold: int | None = None) -> None:
+    def __init__(self, layout_px: Floats) -> None:
         layout = np.array(layout_px, np.float64)
         if layout.ndim != 2 or layout.shape[1] != 2 or len(layout) == 0:
             raise ValueError(f"layout_px has the shape {layout.shape}: must be (markers, 2)")
         self._spacing = float(pdist(layout).min()) if len(layout) > 1 else 100.0
         if not self._spacing > 8:
             raise ValueError(f"layout_px has markers {self._spacing:.1f} px apart: too near")
-        self._layout, self._threshold = layout, threshold
+        self._layout = layout
         m = len(layout)
         self._everywhere = np.ones(m, np.bool_)
         self._everywhere.flags.writeable = False
@@ -115,11 +112,6 @@ class MarkerTracker:
         self._measured = np.zeros((m, 5))
         self._missed = np.zeros(m, np.int64)
         self._radius = self._margin = 0.0
-
-    @property
-    def radius_px(self) -> float:
-        """The markers' median radius; 0 before they were found."""
-        return self._radius
 
     def update(self, frame: Frame) -> FrameMarkers:
         """The markers in the next frame.
@@ -186,7 +178,7 @@ class MarkerTracker:
         # the papillae's radius is 2.0 mm at a spacing of 5.6 mm: 0.36 of it
         apart = self._spacing / shrink
         limits = (np.pi * (0.15 * apart) ** 2, np.pi * (0.5 * apart) ** 2)
-        small = find_blobs(part, self._threshold, *limits)
+        small = find_blobs(part, *limits)
         places = small.xy * shrink + (shrink - 1) / 2
         blobs = Blobs(places, small.area * shrink**2, small.roundness)
         shift, index = match_layout(blobs.xy, self._layout, 0.35 * self._spacing)
@@ -247,7 +239,7 @@ class MarkerTracker:
         if part.shape[0] < 8 or part.shape[1] < 8:
             return
         area = self._area[i]
-        blobs = find_blobs(part, self._threshold, 0.85 * area, 1.15 * area)
+        blobs = find_blobs(part, 0.85 * area, 1.15 * area)
         places = blobs.xy + np.array([left, top])
         taken = self._xy[self._state != LOST]
         if len(taken):
@@ -266,7 +258,7 @@ class MarkerTracker:
     def _find_again(self, frame: Frame) -> bool:
         """Most are lost (the camera was covered, the sensor jumped): search the whole frame."""
         area = float(np.median(self._area))
-        blobs = find_blobs(frame, self._threshold, 0.85 * area, 1.15 * area)
+        blobs = find_blobs(frame, 0.85 * area, 1.15 * area)
         _, index = match_layout(blobs.xy, self._xy, 0.35 * self._spacing)
         seen = index >= 0
         if seen.sum() * 4 < 3 * len(seen):
@@ -278,17 +270,6 @@ class MarkerTracker:
         self._velocity[:] = 0.0
         self._missed[:] = 0
         return True
-
-
-def track(
-    frames: Iterable[Frame], layout_px: Floats, *, threshold: int | None = None
-) -> MarkerTracks:
-    """All markers through a video; see `MarkerTracker`.
-
-    Frames before the markers are first found are NaN.
-    """
-    tracker = MarkerTracker(layout_px, threshold=threshold)
-    return stack_tracks([tracker.update(frame) for frame in frames], len(layout_px))
 
 
 def stack_tracks(rows: list[FrameMarkers], markers: int) -> MarkerTracks:

@@ -101,21 +101,6 @@ def relative_to_plate(
     return xy - plate_xy[:, None, :]
 
 
-def displacements(
-    xy: NDArray[np.float64],
-    reference_frames: slice | NDArray[np.bool_],
-    plate_xy: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Distance of each marker from its mean place over the reference frames, (n, m) pixels.
-
-    NaN where the marker or the plate is unknown in that frame, or in all of the reference frames.
-    Arguments and errors as for `mean_positions` and `relative_to_plate`.
-    """
-    xy = relative_to_plate(xy, plate_xy)
-    moved = xy - mean_positions(xy, reference_frames)
-    return np.hypot(moved[:, :, 0], moved[:, :, 1])
-
-
 def paper_onsets(
     frame_ns: NDArray[np.int64],
     displacement: NDArray[np.float64],

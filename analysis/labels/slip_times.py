@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.change_point import change_point, departure
-from sliplab.analysis.labels.doubts import Doubts
 from sliplab.analysis.labels.onsets import NO_ONSET, LabelOnsets
+from sliplab.storage.schema.label import OnsetDoubts
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,7 +46,7 @@ class SlipTimes:
             int(self.at_ns[first]), None if gross == NO_ONSET else gross, first, self.at_ns
         )
 
-    def doubts(self) -> Doubts:
+    def doubts(self) -> OnsetDoubts:
         """Return the onsets that these intervals leave ambiguous."""
         onsets, wide = self.onsets, self.high_ns - self.low_ns > self.widest_ns
         gross = incipient = None
@@ -56,7 +56,7 @@ class SlipTimes:
             for marker in np.flatnonzero(wide).tolist():
                 if self.low_ns[marker] < onsets.incipient_ns + self.widest_ns // 2:
                     incipient = f"marker {marker}'s slip is only known to {self._width(marker)}"
-        return Doubts(incipient, gross)
+        return OnsetDoubts(incipient=incipient, gross=gross)
 
     def _width(self, marker: int) -> str:
         return f"{(self.high_ns[marker] - self.low_ns[marker]) / 1e6:.0f} ms"

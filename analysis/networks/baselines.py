@@ -10,7 +10,6 @@ events of each cell, gradient boosting on the counts of cells and steps, and ord
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 from threadpoolctl import threadpool_limits
 
-from sliplab.analysis.metrics.classification import CLASSES, Labels, accuracy, check_labels
+from sliplab.analysis.metrics.classification import CLASSES, Labels, check_labels
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sparse import SparseWindows
 
@@ -34,77 +33,41 @@ SLICES = 10
 """Parts of a window for `logistic_slices`."""
 
 
-@dataclass(frozen=True)
-class BaselineScore:
-    """One baseline on the test samples.
-
-    Attributes:
-        name: ``majority``, ``rate_threshold`` or ``logistic``.
-        argmax: accuracy in 0..1 by `metrics.classification.accuracy` (ties are shared); None where
-            there are no test samples.
-        parameters: what was fitted, as plain data.
-        votes: (n, classes) for each test sample, the highest is its class.
-    """
-
-    name: str
-    argmax: float | None
-    parameters: dict[str, Any]
-    votes: npt.NDArray[Any]
-
-
-def evaluate_baselines(
+def cheap_votes(
     train_x: SparseWindows,
     train_y: Labels,
     test_x: SparseWindows,
-    test_y: Labels,
-    names: Sequence[str] = CLASSES,
-) -> dict[str, BaselineScore]:
-    """Fit the cheap baselines on the training samples and score them on the test samples.
+    classes: int = len(CLASSES),
+) -> dict[str, npt.NDArray[Any]]:
+    """Fit the cheap baselines on the training samples, and vote on the test samples.
 
     Two thresholds cut the totals into three parts, so they are there for three classes only.
 
     Args:
         train_x, test_x: event counts.
-        train_y, test_y: classes, integer (n,), from 0.
-        names: of the classes.
+        train_y: classes, integer (n,), from 0.
+
+    Returns:
+        votes (n, classes) by ``majority``, ``rate_threshold`` and ``logistic``; of each test
+        sample the highest is its class.
 
     Raises:
         ValueError: no training samples, lengths that differ, a label that is not a class.
     """
-    classes = len(names)
-    train_y, test_y = check_labels(train_y, classes), check_labels(test_y, classes)
-    if len(train_x) != len(train_y) or len(test_x) != len(test_y):
+    train_y = check_labels(train_y, classes)
+    if len(train_x) != len(train_y):
         raise ValueError("samples and labels differ in number")
     if not len(train_y):
         raise ValueError("no training samples")
     train_total, test_total = (x.totals.astype(np.float64) for x in (train_x, test_x))
     each = np.bincount(train_y, minlength=classes)
-    rate = fit_logistic(_of_total(train_total), train_y, classes)
-
-    decisions: dict[str, tuple[npt.NDArray[Any], dict[str, Any]]] = {
-        "majority": (
-            np.tile(each, (len(test_y), 1)),
-            {"training_samples": dict(zip(names, each.tolist(), strict=True))},
-        )
-    }
+    votes: dict[str, npt.NDArray[Any]] = {"majority": np.tile(each, (len(test_x), 1))}
     if classes == len(CLASSES):
         low, high, table = fit_rate_thresholds(train_total, train_y)
-        decisions["rate_threshold"] = (
-            table[np.searchsorted([low, high], test_total)],
-            {"thresholds_events": [low, high], "training_samples": table.tolist()},
-        )
-    decisions["logistic"] = (
-        rate.scores(_of_total(test_total)),
-        {
-            "weights": rate.weights.tolist(),
-            "mean": rate.mean.tolist(),
-            "scale": rate.scale.tolist(),
-        },
-    )
-    return {
-        name: BaselineScore(name, accuracy(votes, test_y).argmax, parameters, votes)
-        for name, (votes, parameters) in decisions.items()
-    }
+        votes["rate_threshold"] = table[np.searchsorted([low, high], test_total)]
+    rate = fit_logistic(_of_total(train_total), train_y, classes)
+    votes["logistic"] = rate.scores(_of_total(test_total))
+    return votes
 
 
 def logistic_cells(
@@ -238,20 +201,31 @@ class Logistic:
         return np.asarray(_standard(features, self.mean, self.scale) @ self.weights)
 
 
-def fit_logistic(features: FloatArray, labels: IntArray, classes: int = len(CLASSES)) -> Logistic:
+def fit_logistic(
+    features: FloatArray,
+    labels: IntArray,
+    classes: int = len(CLASSES),
+    *,
+    balanced: bool = False,
+) -> Logistic:
     """Multinomial logistic regression on standardised features, by L-BFGS from zero.
 
     Minimises mean cross-entropy + `RIDGE` / 2 times the squared weights (not the offsets); the
     problem is convex and the start fixed, so the result repeats.
 
     Args:
-        features: (n, features).
+        features: (n, features), n at least 1.
         labels: integer (n,), 0..classes - 1.
+        balanced: the mean is over the classes that have samples, of the means within each.
     """
     mean, spread = features.mean(axis=0), features.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     x = _standard(features, mean, scale)
-    target = np.eye(classes)[labels]
+    each = np.bincount(labels, minlength=classes)
+    share, total = np.ones((len(x), 1)), float(len(x))
+    if balanced:
+        share, total = 1.0 / (each[labels] * (each > 0).sum())[:, None], 1.0
+    target = np.eye(classes)[labels] * share
     shape = (x.shape[1], classes)
     penalty = np.full(shape, RIDGE)
     penalty[0] = 0.0
@@ -259,8 +233,8 @@ def fit_logistic(features: FloatArray, labels: IntArray, classes: int = len(CLAS
     def objective(flat: FloatArray) -> tuple[float, FloatArray]:
         w = flat.reshape(shape)
         log_p = log_softmax(x @ w, axis=1)
-        loss = -(target * log_p).sum() / len(x) + 0.5 * (penalty * w * w).sum()
-        gradient = x.T @ (np.exp(log_p) - target) / len(x) + penalty * w
+        loss = -(target * log_p).sum() / total + 0.5 * (penalty * w * w).sum()
+        gradient = x.T @ (np.exp(log_p) * share - target) / total + penalty * w
         return float(loss), gradient.ravel()
 
     # sums over threads differ between numbers of them, and waiting costs the most

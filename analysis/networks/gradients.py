@@ -39,7 +39,7 @@ from sliplab.analysis.networks.network import (
     reset_states,
     set_matrices,
 )
-from sliplab.analysis.networks.spiking import GradientJob, Trainer, WindowLoss, neuron
+from sliplab.analysis.networks.spiking import Trainer, WindowGradients, neuron
 from sliplab.analysis.windows.sparse import SparseWindows
 
 
@@ -104,26 +104,23 @@ class EventDriven:
 
     def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> GradientBatch:
         """Compute parts in any order and sum them in theirs: the same bits with any threads."""
-        leaves = self._trainer.leaves
 
-        def compute(some: IntArray) -> tuple[float, GradientJob, tuple[torch.Tensor, ...]]:
-            job = GradientJob(self._trainer, x, some, y[some], self._gain)
-            loss = WindowLoss.apply(job, *leaves)  # type: ignore[no-untyped-call]
-            return loss.item(), job, torch.autograd.grad(loss, leaves)
+        def compute(some: IntArray) -> WindowGradients:
+            return self._trainer.gradients(x, some, y[some], self._gain)
 
         parts = [rows[k : k + MICRO_BATCH] for k in range(0, len(rows), MICRO_BATCH)]
         done = list(pool.map(compute, parts))
         fired = dict.fromkeys(SPIKING, 0.0)
-        for some, (_, job, _) in zip(parts, done, strict=True):
-            for name, rate in job.rates().items():
+        for some, found in zip(parts, done, strict=True):
+            for name, rate in found.rates.items():
                 fired[name] += rate * len(some)
         sums = [
-            torch.stack(each).sum(dim=0).numpy()
-            for each in zip(*(grads for _, _, grads in done), strict=True)
+            torch.stack([*map(torch.from_numpy, each)]).sum(dim=0).numpy()
+            for each in zip(*(found.grads for found in done), strict=True)
         ]
         return GradientBatch(
-            sum(loss for loss, _, _ in done),
-            np.concatenate([job.counts for _, job, _ in done]),
+            sum(found.loss for found in done),
+            np.concatenate([found.counts for found in done]),
             fired,
             by_parameter(self._trainer.layout.unpack(sums)),
         )

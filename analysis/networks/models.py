@@ -81,18 +81,24 @@ def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, 
 
 
 def wanted_models(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
+    store: Store,
+    campaigns: list[Collected],
+    reviewed: bool = False,
+    classes: tuple[str, ...] = (),
 ) -> list[ModelOnDisk]:
     """The models that the settings ask for, with the keys they must have.
 
     Args:
         reviewed: people's decisions are applied to the labels.
+        classes: that the recordings show; by default slip, in the kinematic campaigns.
 
     Raises:
         StoreError: a trial has no fresh label yet.
+        InputError: the campaigns' windows differ.
     """
-    used = training_campaigns(campaigns)
-    return _models(StoreLabels(store, reviewed), used, used[0].settings, "")
+    used = agreeing(campaigns) if classes else training_campaigns(campaigns)
+    prefix = CLASS_PREFIX if classes else ""
+    return _models(StoreLabels(store, reviewed), used, used[0].settings, prefix, classes)
 
 
 def comparison_models(
@@ -104,21 +110,6 @@ def comparison_models(
         return []
     labels, used = StoreLabels(store, reviewed), training_campaigns(campaigns)
     return _models(labels, used, settings, f"{settings.preset}-")
-
-
-def wanted_class_models(
-    labels: StoreLabels, campaigns: list[Collected], classes: tuple[str, ...]
-) -> list[ModelOnDisk]:
-    """The models of recordings that show classes; see `wanted_models`.
-
-    Raises:
-        StoreError: a trial has no fresh label yet.
-        InputError: the campaigns' windows differ.
-    """
-    used = agreeing(campaigns)
-    for item in used:
-        item.need("events", "the network is trained on windows of them")
-    return _models(labels, used, used[0].settings, CLASS_PREFIX, classes)
 
 
 def _models(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -155,100 +156,26 @@ class StatefulNetwork:
         classes = self._scratch[1][-1][:n] % np.uint64(engine.classes)
         return np.bincount(classes.astype(np.int64), minlength=engine.classes).astype(np.uint8)
 
-    def reset(self) -> None:
-        """Reset the potentials to rest."""
-        for state, rest in zip(self._state, self._engine._layout.rest, strict=True):
-            state[:] = rest
 
-
-class WindowLoss(torch.autograd.Function):
-    """The loss of a few windows as a function of the weights, for training with torch.
-
-    The sum of the cross-entropies of their output spike counts times the job's gain. The gradient
-    is computed with it.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, job: GradientJob, *weights: torch.Tensor) -> torch.Tensor:
-        """Float64 (); `weights` are the trainer's `leaves`."""
-        ctx.job = job
-        return torch.tensor(job.run(), dtype=torch.float64)
-
-    @staticmethod
-    def backward(ctx: Any, by_loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Surrogate gradients by the weights."""
-        factor = float(by_loss)
-        grads = map(torch.from_numpy, ctx.job.grads)
-        return None, *(grads if factor == 1.0 else (grad * factor for grad in grads))
-
-
-class GradientJob:
+@dataclass(frozen=True)
+class WindowGradients:
     """A few windows through a network and back.
 
-    Args:
-        trainer: the network.
-        windows: samples; `rows` of them are meant.
-        rows: int64 (n,).
-        labels: classes int64 (n,) of these rows.
-        gain: what a spike counts in the cross-entropy.
-
     Attributes:
-        counts: output spikes int64 (n, classes), when it was run.
-        grads: float32, gradients by the packed weights.
+        loss: the sum of the cross-entropies of their output spike counts times the gain.
+        counts: output spikes int64 (n, classes).
+        rates: mean spikes per neuron and step of each spiking layer, by name.
+        grads: float32, gradients of the loss by the packed weights of each layer.
     """
 
-    def __init__(
-        self,
-        trainer: Trainer,
-        windows: SparseWindows,
-        rows: I64,
-        labels: I64,
-        gain: float = 1.0,
-    ) -> None:
-        self._gain = gain
-        self._trainer, self._windows, self._rows, self._labels = trainer, windows, rows, labels
-        self._fired = np.zeros(len(SPIKING), np.int64)
-        self.counts = np.zeros((len(rows), trainer.classes), np.int64)
-        self.grads = tuple(np.zeros_like(w) for w in trainer.layers[1])
-
-    def run(self) -> float:
-        """The summed loss; once."""
-        trainer, x = self._trainer, self._windows
-        memory = trainer.borrow()
-        loss = spiking_gradients.windows_loss(
-            x.cell,
-            x.count,
-            x.offsets,
-            self._rows,
-            self._labels,
-            self._gain,
-            trainer.steps,
-            trainer.layers,
-            trainer.layout.spans,
-            trainer.back,
-            trainer.constants,
-            trainer.layout.rest,
-            memory[:4],
-            trainer.layout.neurons[-1],
-            memory[4],
-            self.counts,
-            self._fired,
-            self.grads,
-        )
-        trainer.give_back(memory)
-        return float(loss)
-
-    def rates(self) -> dict[str, float]:
-        """Mean spikes per neuron and step of each spiking layer, by name, when it was run."""
-        steps = self._trainer.steps * len(self._rows)
-        return {
-            name: int(self._fired[k]) / (steps * self._trainer.layout.neurons[k])
-            for k, name in enumerate(SPIKING)
-        }
+    loss: float
+    counts: I64
+    rates: dict[str, float]
+    grads: tuple[F32, ...]
 
 
 class Trainer:
-    """A network's packed weights and memory, for `GradientJob`s in several threads."""
+    """A network's packed weights and memory, for gradients in several threads."""
 
     def __init__(self, net: nn.Sequential, cells: int) -> None:
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
@@ -262,8 +189,47 @@ class Trainer:
         """Use these weights from now on."""
         self.layers = self.layout.layers(weights)
         self.back = self.layout.back(weights)
-        self.leaves = tuple(torch.from_numpy(w).requires_grad_() for w in self.layers[1])
-        """The packed weights, by which `WindowLoss` is differentiated."""
+
+    def gradients(
+        self, x: SparseWindows, rows: I64, labels: I64, gain: float = 1.0
+    ) -> WindowGradients:
+        """Run some windows forward and back.
+
+        Args:
+            rows: int64 (n,), which windows.
+            labels: classes int64 (n,) of these.
+            gain: what a spike counts in the cross-entropy.
+        """
+        fired = np.zeros(len(SPIKING), np.int64)
+        counts = np.zeros((len(rows), self.classes), np.int64)
+        grads = tuple(np.zeros_like(w) for w in self.layers[1])
+        memory = self.borrow()
+        loss = spiking_gradients.windows_loss(
+            x.cell,
+            x.count,
+            x.offsets,
+            rows,
+            labels,
+            gain,
+            self.steps,
+            self.layers,
+            self.layout.spans,
+            self.back,
+            self.constants,
+            self.layout.rest,
+            memory[:4],
+            self.layout.neurons[-1],
+            memory[4],
+            counts,
+            fired,
+            grads,
+        )
+        self.give_back(memory)
+        steps = self.steps * len(rows)
+        rates = {
+            name: int(fired[k]) / (steps * self.layout.neurons[k]) for k, name in enumerate(SPIKING)
+        }
+        return WindowGradients(float(loss), counts, rates, grads)
 
     def borrow(self) -> tuple[Any, Any, Any, Any, F32]:
         """Return the state, scratch, record, planes and a padded row for one thread.

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.networks.lanes import LANES, add, add_times
-from sliplab.analysis.networks.spiking_kernels import add_bias, fire, scatter, scatter_counts
+from sliplab.analysis.networks.spiking_kernels import add_bias, fire, scatter
 from sliplab.storage.kernels import njit
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
@@ -69,13 +69,14 @@ def forward_kept(
         ends[k][0] = _U0
     for t in range(steps):
         at = row * steps + t
-        scatter_counts(
+        scatter(
             cell, count, offsets[at], offsets[at + 1], reach[0], weights[0], shape[0], currents[0]
         )
         for k in range(len(state)):
             if k > 0:
                 scatter(
                     lists[k - 1],
+                    None,
                     ends[k - 1][t],
                     ends[k - 1][t + 1],
                     reach[k],

@@ -30,50 +30,40 @@ from sliplab.analysis.networks.lanes import BLOCK, LANES, add, add_times, fires,
 from sliplab.storage.kernels import njit
 
 _U0, _U1 = np.uint64(0), np.uint64(1)
+_F1 = np.float32(1.0)
 _LANES, _BLOCK = np.uint64(LANES), np.uint64(BLOCK)
 
 
 @njit(cache=True, nogil=True)
-def scatter_counts(
-    cell: Any,
-    count: Any,
-    begin: int,
-    end: int,
+def scatter(
+    sources: Any,
+    counts: Any,
+    begin: Any,
+    end: Any,
     reach: Any,
     weights: Any,
     shape: Any,
     current: Any,
 ) -> None:
-    """Currents grow by the weights of each non-empty cell, times its count.
+    """Currents grow by the weights of each source, times its count.
 
     Args:
-        cell, count: sources and how often each is active; those at [begin, end).
+        sources: non-empty cells, or neurons that fired; those at [begin, end).
+        counts: how often each is active; None for once.
         reach: uint32 (sources, 2): first current, first weight.
         weights, current: float32, flat.
         shape: uint64: from a run to the next among weights, among currents, runs, length of one.
     """
     stride_w, stride, runs, length = shape
     for e in range(begin, end):
-        at, w = np.uint64(reach[cell[e], 0]), np.uint64(reach[cell[e], 1])
-        amount = np.float32(count[e])
+        at, w = np.uint64(reach[sources[e], 0]), np.uint64(reach[sources[e], 1])
+        amount = _F1 if counts is None else np.float32(counts[e])
         for _ in range(runs):
             for j in range(_U0, length, _LANES):
-                add_times(current, at + j, weights, w + j, amount)
-            at += stride
-            w += stride_w
-
-
-@njit(cache=True, nogil=True)
-def scatter(
-    spikes: Any, begin: Any, end: Any, reach: Any, weights: Any, shape: Any, current: Any
-) -> None:
-    """Currents grow by the weights of each spike at [begin, end); otherwise `scatter_counts`."""
-    stride_w, stride, runs, length = shape
-    for e in range(begin, end):
-        at, w = np.uint64(reach[spikes[e], 0]), np.uint64(reach[spikes[e], 1])
-        for _ in range(runs):
-            for j in range(_U0, length, _LANES):
-                add(current, at + j, weights, w + j)
+                if counts is None:
+                    add(current, at + j, weights, w + j)
+                else:
+                    add_times(current, at + j, weights, w + j, amount)
             at += stride
             w += stride_w
 
@@ -153,7 +143,7 @@ def step(
             high[y] = max(high[y], at + length)
             at += stride
             y += _U1
-    scatter_counts(cell, count, begin, end, reach[0], weights[0], shape[0], currents[0])
+    scatter(cell, count, begin, end, reach[0], weights[0], shape[0], currents[0])
     n, done = _U0, _U0
     for y in range(rows):
         if low[y] < high[y]:
@@ -165,7 +155,7 @@ def step(
     for k in range(1, len(currents)):
         if n == _U0 and bias[k] < 0:
             continue
-        scatter(spikes[k - 1], _U0, n, reach[k], weights[k], shape[k], currents[k])
+        scatter(spikes[k - 1], None, _U0, n, reach[k], weights[k], shape[k], currents[k])
         add_bias(bias[k], weights[k], shape[k][3], currents[k])
         n = fire(
             currents[k],

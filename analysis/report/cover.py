@@ -6,15 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.latency import EXPERIMENTS, draw_times
 from sliplab.analysis.report.outcomes import TIMES
 from sliplab.analysis.report.page import (
-    Content,
     Figure,
     Number,
-    Rendered,
-    render_page,
     with_interval,
 )
 from sliplab.protocols.shown import plural
@@ -50,18 +46,6 @@ class Cover:
     answer: Answer
     notices: Sequence[str]
     headline: Sequence[Number]
-
-    def render(
-        self,
-        campaigns: Sequence[Collected],
-        sections: Sequence[Content | Rendered],
-        *,
-        simulated: bool,
-    ) -> str:
-        """Render the page; everything in it is escaped but the figures' SVG."""
-        return render_page(
-            self.template, sections, simulated=simulated, campaigns=campaigns, cover=self
-        )
 
 
 def slip_answer(summary: Summary | OneCameraSummary) -> Answer:

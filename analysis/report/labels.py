@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels import label_errors
 from sliplab.analysis.report.campaign import source_words
 from sliplab.analysis.report.figures.trials import label_uncertainty
 from sliplab.analysis.report.page import Content, Figure, Table, number
@@ -55,21 +56,17 @@ class LabelSection(Content):
 
 def label_section(
     store: Store,
-    campaigns: Sequence[Collected],
+    campaigns: list[Collected],
     summary: Summary | OneCameraSummary,
-    distances: Mapping[str, Mapping[str, Sequence[float]]],
 ) -> LabelSection | None:
-    """Compare the labels; None where nothing is labelled by both rules.
-
-    Args:
-        distances: of each trial's onset from the truth, ms, by rule and onset.
-    """
+    """Compare the labels; None where nothing is labelled by both rules."""
     if (labels := summary.labels) is None:
         return None
     rules = labels.rules_ms
     if not rules.apart.incipient.n:
         return None
     known = rules.paper.incipient.n > 0
+    distances = label_errors.distances(store, campaigns)
     errors = {RULES[rule]: kinds for rule, kinds in distances.items()}
     every = [
         (

@@ -115,16 +115,14 @@ def one_camera_summary(
             source=label_sources(campaigns),
             holds=label_errors.holds_compared(store, campaigns),
         )
+    left_out = {} if labelled else {"label": NO_LABELS}
+    left_out |= {} if evaluated else dict.fromkeys(("train", "evaluate"), NO_CLASSIFIER)
     if not frames:
         rates = {item.name: _rate(item) for item in campaigns}
     return OneCameraSummary(
         simulated=store.simulated,
         one_camera="frames" if frames else "events",
-        left_out=tuple(
-            StepLeftOut(name=name, reason=reason)
-            for name in ("label", "train", "evaluate")
-            if (reason := _not_done(name, evaluated, labelled)) is not None
-        ),
+        left_out=tuple(StepLeftOut(name=name, reason=why) for name, why in left_out.items()),
         labels=labels,
         event_rates=rates,
         references=references_of(store, campaigns),
@@ -135,13 +133,6 @@ def one_camera_summary(
         versions=package_versions(),
         protocols=protocol_hashes(campaigns),
     )
-
-
-def _not_done(step: str, evaluated: bool, labelled: bool) -> str | None:
-    """Return the reason for a step that can be done and was not; None where it was."""
-    if step == "label":
-        return None if labelled else NO_LABELS
-    return NO_CLASSIFIER if not evaluated and step in {"train", "evaluate"} else None
 
 
 def _clocks(campaigns: Sequence[Collected]) -> dict[str, float]:
@@ -233,9 +224,34 @@ def left_out_section(summary: OneCameraSummary) -> LeftOutSection:
 
 def rate_section(campaigns: Sequence[Collected], summary: OneCameraSummary) -> RateSection | None:
     """Show event rates; None without events."""
-    if summary.event_rates is None:
+    if (rates := summary.event_rates) is None:
         return None
-    return _rates(campaigns, summary.event_rates, summary.simulated)
+    each = {item.name: [_binned(r) for _, r in item.trials] for item in campaigns if item.trials}
+    longest = max((len(rate) for found in each.values() for rate in found), default=0)
+    seconds = (np.arange(longest) + 0.5) * BIN_S - BEFORE_S
+    curves, data = {}, {"time from the start of the motion (s)": seconds.tolist()}
+    for name, found in each.items():
+        table = np.full((len(found), longest), np.nan)
+        for row, rate in zip(table, found, strict=True):
+            row[: len(rate)] = rate
+        # from where on most trials are over, the median would be of the slow ones alone
+        there = np.isfinite(table).mean(axis=0) >= 0.5
+        low, middle, high = np.full((3, longest), np.nan)
+        low[there], middle[there], high[there] = np.nanquantile(
+            table[:, there], (0.25, 0.5, 0.75), axis=0
+        )
+        curves[name] = (low, middle, high)
+        data[f"{name}: median (events/s)"] = [None if np.isnan(v) else v for v in middle.tolist()]
+    rows = [
+        [name, str(rate.trials), number(rate.hold, 0), number(rate.motion, 0)]
+        for name, rate in rates.items()
+    ]
+    return RateSection(
+        Figure(
+            rates_over_motion(seconds, curves, simulated=summary.simulated), "event-rates", data
+        ),
+        Table(("campaign", "trials", "in the hold (events/s)", "in the motion (events/s)"), rows),
+    )
 
 
 def one_camera_sections(
@@ -260,8 +276,7 @@ def one_camera_sections(
         skin_section(campaigns),
     ]
     if summary.labels is not None:
-        distances = label_errors.distances(store, campaigns)
-        sections.append(label_section(store, campaigns, summary, distances))
+        sections.append(label_section(store, campaigns, summary))
     sections.append(rate_section(campaigns, summary))
     if summary.one_camera == "events":
         page = (store.folder / "report" / clocks.PAGE).exists()
@@ -275,36 +290,6 @@ def one_camera_sections(
         ]
         sections.append(OwnClocks(Table(("clock", "timed by", "uncertainty (µs)"), rows)))
     return [section for section in sections if section is not None]
-
-
-def _rates(
-    campaigns: Sequence[Collected], rates: Mapping[str, MotionRate], simulated: bool
-) -> RateSection:
-    """Draw the event rate around the motion's start."""
-    each = {item.name: [_binned(r) for _, r in item.trials] for item in campaigns if item.trials}
-    longest = max((len(rate) for found in each.values() for rate in found), default=0)
-    seconds = (np.arange(longest) + 0.5) * BIN_S - BEFORE_S
-    curves, data = {}, {"time from the start of the motion (s)": seconds.tolist()}
-    for name, found in each.items():
-        table = np.full((len(found), longest), np.nan)
-        for row, rate in zip(table, found, strict=True):
-            row[: len(rate)] = rate
-        # from where on most trials are over, the median would be of the slow ones alone
-        there = np.isfinite(table).mean(axis=0) >= 0.5
-        low, middle, high = np.full((3, longest), np.nan)
-        low[there], middle[there], high[there] = np.nanquantile(
-            table[:, there], (0.25, 0.5, 0.75), axis=0
-        )
-        curves[name] = (low, middle, high)
-        data[f"{name}: median (events/s)"] = [None if np.isnan(v) else v for v in middle.tolist()]
-    rows = [
-        [name, str(rate.trials), number(rate.hold, 0), number(rate.motion, 0)]
-        for name, rate in rates.items()
-    ]
-    return RateSection(
-        Figure(rates_over_motion(seconds, curves, simulated=simulated), "event-rates", data),
-        Table(("campaign", "trials", "in the hold (events/s)", "in the motion (events/s)"), rows),
-    )
 
 
 def _binned(recording: Recording) -> F64:

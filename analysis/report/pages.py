@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sliplab.analysis.campaigns import Collected, missing_stream
 from sliplab.analysis.report import one_camera, report
 from sliplab.analysis.report.cover import Cover
-from sliplab.analysis.report.page import Content, Figure, Rendered
+from sliplab.analysis.report.page import Content, Figure, Rendered, render_page
 from sliplab.analysis.report.sources import read_sources, report_key
 from sliplab.analysis.report.summary import make_summary
 from sliplab.storage.schema.summary import OneCameraSummary
@@ -81,7 +81,7 @@ def _evaluated(
     """
     sources = read_sources(store, campaigns, planned, seconds)
     summary = make_summary(sources)
-    sections = report.make_sections(sources, summary, report.read_shown(sources))
+    sections = report.make_sections(sources, summary)
     numbers = summary.to_json()
     if without_frames is not None:
         rates = one_camera.rate_section(campaigns, without_frames)
@@ -103,7 +103,9 @@ def make_page(
         numbers: of the summary; `simulated` is one.
     """
     simulated = bool(numbers["simulated"])
-    html = cover.render(campaigns, sections, simulated=simulated)
+    html = render_page(
+        cover.template, sections, simulated=simulated, campaigns=campaigns, cover=cover
+    )
     figures = [figure for section in sections for figure in section.all_figures()]
     figures += [] if cover.answer.figure is None else [cover.answer.figure]
     return Page(numbers, figures, html, simulated)

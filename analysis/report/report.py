@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-import numpy.typing as npt
+from typing import ClassVar
 
 from sliplab.analysis.detectors.predictions import trial_counts
-from sliplab.analysis.labels import label_errors
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.models import choose_model, wanted_models
-from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
 from sliplab.analysis.report.cover import Cover, quality_notices, slip_answer
@@ -31,40 +27,8 @@ from sliplab.analysis.report.registration import registration_section
 from sliplab.analysis.report.skins import skin_section
 from sliplab.analysis.report.sources import Sources
 from sliplab.analysis.report.tiles import slip_tiles
-from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
+from sliplab.analysis.report.trial import choose_example, output_section, trial_section
 from sliplab.storage.schema.summary import SeedsUsed, Summary
-
-
-@dataclass(frozen=True)
-class ReportMaterial:
-    """Material of the page besides the summary's numbers.
-
-    Attributes:
-        example: the trial shown in detail, with its `counts` and `end_ns`.
-        distances: of each trial's onset from the truth, ms, by rule and onset.
-    """
-
-    fitted: Fitted
-    example: tuple[Example, Mapping[str, npt.NDArray[Any]]] | None
-    distances: Mapping[str, Mapping[str, Sequence[float]]]
-
-
-def read_shown(sources: Sources) -> ReportMaterial:
-    """Read what the page shows besides the summary's numbers."""
-    store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
-    models = wanted_models(store, campaigns, evaluation.reviewed is not None)
-    model = choose_model(models)
-    example = choose_example(campaigns, evaluation.trials)
-    counts: Mapping[str, npt.NDArray[Any]] = {}
-    if example is not None:
-        rule = evaluation.detection[example.item.name]
-        trial = example.recording.trial_id
-        counts = trial_counts(store, example.item.name, trial, rule)
-    return ReportMaterial(
-        model_file.load(model.path),
-        None if example is None else (example, counts),
-        label_errors.distances(store, campaigns),
-    )
 
 
 @dataclass(frozen=True)
@@ -104,23 +68,20 @@ def _choice(summary: Summary) -> list[str]:
     return []
 
 
-def make_sections(
-    sources: Sources, summary: Summary, shown: ReportMaterial
-) -> list[Content | Rendered]:
+def make_sections(sources: Sources, summary: Summary) -> list[Content | Rendered]:
     """Make all sections, in order.
 
     Raises:
         StoreError: another program's result is of another shape.
     """
-    store, campaigns = sources.store, sources.campaigns
+    store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
     simulated, kinematic = summary.simulated, summary.kinematic
-    rows = sources.evaluation.trials
+    model = choose_model(wanted_models(store, campaigns, evaluation.reviewed is not None))
     trial, outputs, seen = None, None, None
-    if shown.example is not None:
-        example, counts = shown.example
-        seen = example.recording
+    if (example := choose_example(campaigns, evaluation.trials)) is not None:
+        seen, rule = example.recording, evaluation.detection[example.item.name]
+        counts = trial_counts(store, example.item.name, seen.trial_id, rule)
         trial = trial_section(store, example, simulated=simulated)
-        rule = sources.evaluation.detection[example.item.name]
         outputs = output_section(example, counts, rule, simulated=simulated)
     holdout = None
     data = ReportData(store, campaigns, simulated, summary)
@@ -128,22 +89,22 @@ def make_sections(
         holdout = holdout_section(summary.holdout, kinematic, HOLDOUT.command(store), HOLDOUT.file)
     page = (store.folder / "report" / clocks.PAGE).exists()
     sections: list[Content | Rendered | None] = [
-        latency_section("kinematic", campaigns, rows, summary),
-        latency_section("gravity", campaigns, rows, summary),
-        latency_section("disturbance", campaigns, rows, summary),
+        latency_section("kinematic", campaigns, evaluation.trials, summary),
+        latency_section("gravity", campaigns, evaluation.trials, summary),
+        latency_section("disturbance", campaigns, evaluation.trials, summary),
         failure_section(store.folder, summary.trials),
-        windows.network_section(kinematic, shown.fitted, simulated=simulated),
+        windows.network_section(kinematic, model_file.load(model.path), simulated=simulated),
         windows.where_section(kinematic, simulated=simulated),
         holdout,
         collected_section(campaigns, summary),
-        registration_section(store, list(campaigns)),
+        registration_section(store, campaigns),
         *plugin_sections(data),
         quality_section(campaigns, summary.references, simulated=simulated),
-        skin_section(campaigns, rows),
+        skin_section(campaigns, evaluation.trials),
         trial,
         outputs,
         force_section(store, campaigns, seen, simulated=simulated),
-        label_section(store, campaigns, summary, shown.distances),
+        label_section(store, campaigns, summary),
         clocks.clock_section(campaigns, summary.sync, page=page, simulated=simulated),
         windows.lead_section(kinematic, simulated=simulated),
         windows.work_section(kinematic),

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from statistics import median
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
+
+import pandas as pd
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.page import Content, Table, number
 from sliplab.protocols.split import PARTS
 from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.trials.context import SKIN
+from sliplab.storage.trials.recording import Recording
 
-
-@dataclass
-class _SkinTrials:
-    """The trials of one skin of a campaign; rates in 1/s, times in ms."""
-
-    parts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PARTS, 0))
-    trials: int = 0
-    event_rates: list[float] = field(default_factory=list)
-    slips: list[float] = field(default_factory=list)
-    latencies: list[float] = field(default_factory=list)
-    leads: list[float] = field(default_factory=list)
+_FIGURES = {
+    "events (1/s)": 0,
+    "motion to first slip (ms)": 1,
+    "latency, incipient (ms)": 1,
+    "lead (ms)": 1,
+}
+"""Figures whose medians are shown, and their digits."""
 
 
 @dataclass(frozen=True)
@@ -51,68 +49,51 @@ def skin_section(
         rows: of the evaluation.
     """
     scores = {(row.campaign, row.trial): row for row in rows}
-    found: dict[tuple[str, str], _SkinTrials] = {}
-    for item in campaigns:
-        if item.recorded is None:
-            _add(found, item, scores)
-    skins = list(dict.fromkeys(skin for _, skin in found))
+    trials = pd.DataFrame(
+        [
+            {
+                "skin": recording.context.get(SKIN, "not known"),
+                "campaign": item.name,
+                "part": trial.split,
+                **_figures(recording, scores.get((item.name, trial.id))),
+            }
+            for item in campaigns
+            if item.recorded is None
+            for trial, recording in item.trials
+        ],
+        columns=["skin", "campaign", "part", *_FIGURES],
+    )
+    skins = trials["skin"].unique().tolist()
     if len(skins) < 2:
         return None
-
-    def having(part: str) -> set[str]:
-        return {skin for (_, skin), of in found.items() if of.parts[part]}
-
-    seen, tested = having("train") | having("validation"), having("test")
-    lines = [
-        [
-            skin,
-            name,
-            *(str(count) for count in (of.trials, *of.parts.values())),
-            _middle(of.event_rates, 0),
-            *(_middle(values, 1) for values in (of.slips, of.latencies, of.leads)),
-        ]
-        for (name, skin), of in found.items()
-    ]
-    columns = (
-        "skin",
-        "campaign",
-        "trials",
-        *PARTS,
-        "events (1/s)",
-        "motion to first slip (ms)",
-        "latency, incipient (ms)",
-        "lead (ms)",
+    seen, tested = (
+        set(trials["skin"][trials["part"].isin(parts)])
+        for parts in (("train", "validation"), ("test",))
     )
+    lines = []
+    for (skin, campaign), there in trials.groupby(["skin", "campaign"], sort=False):
+        counts = [len(there), *((there["part"] == part).sum() for part in PARTS)]
+        middle = there[[*_FIGURES]].astype(float).median()
+        figures = [number(float(middle[name]), digits) for name, digits in _FIGURES.items()]
+        lines.append([skin, campaign, *map(str, counts), *figures])
     return SkinSection(
         skins,
         [skin for skin in skins if skin in seen & tested],
         [skin for skin in skins if skin in tested - seen],
-        Table(columns, lines, "Medians by skin; times are those of test trials."),
+        Table(
+            ("skin", "campaign", "trials", *PARTS, *_FIGURES),
+            lines,
+            "Medians by skin; times are those of test trials.",
+        ),
     )
 
 
-def _add(
-    found: dict[tuple[str, str], _SkinTrials],
-    item: Collected,
-    scores: Mapping[tuple[str, str], TrialScore],
-) -> None:
-    for trial, recording in item.trials:
-        skin = recording.context.get(SKIN, "not known")
-        of = found.setdefault((item.name, skin), _SkinTrials())
-        of.trials += 1
-        if trial.split in of.parts:
-            of.parts[trial.split] += 1
-        record, score = recording.record, scores.get((item.name, trial.id))
-        of.event_rates.append(record.counts.events / record.recorded_s)
-        if score is None:
-            continue
-        if score.incipient_ns is not None:
-            of.slips.append((score.incipient_ns - recording.motion_ns[0]) / 1e6)
-        if score.latency is not None:
-            times = (score.latency.latency_incipient_ms, score.latency.lead_ms)
-            for values, time in zip((of.latencies, of.leads), times, strict=True):
-                values += [] if time is None else [time]
-
-
-def _middle(values: Sequence[float], digits: int) -> str:
-    return number(median(values) if values else None, digits)
+def _figures(recording: Recording, score: TrialScore | None) -> dict[str, float | None]:
+    """Return the figures of a trial by the headings of `_FIGURES`."""
+    slip_ms = late_ms = lead_ms = None
+    if score is not None and score.incipient_ns is not None:
+        slip_ms = (score.incipient_ns - recording.motion_ns[0]) / 1e6
+    if score is not None and score.latency is not None:
+        late_ms, lead_ms = score.latency.latency_incipient_ms, score.latency.lead_ms
+    rate = recording.record.counts.events / recording.record.recorded_s
+    return dict(zip(_FIGURES, (rate, slip_ms, late_ms, lead_ms), strict=True))

@@ -34,7 +34,7 @@ class SampleSet:
 
     Attributes:
         windows: event counts (n, steps, channels, cells, cells), sparse.
-        y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross; or those of `span_samples`.
+        y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross; or those of `span_starts`.
         trial: int64 (n,), each sample's trial by its index in `trials`.
         start_ns: int64 (n,), start of each window on its trial's time line.
         trials: the trials, each once; one may have no samples.
@@ -181,41 +181,10 @@ def sample_starts(
     return starts, classes
 
 
-def trial_samples(
-    recording: Recording,
-    label: TrialLabel,
-    trial: TrialId,
-    windows: Windows,
-    samples: SampleSettings,
-    seed: int,
-) -> SampleSet:
-    """The samples of one trial by the paper's rule.
-
-    Args:
-        label: the trial's, for its onsets.
-        trial: what the samples carry.
-        seed: of the random windows within incipient slip.
-    """
-    starts, classes = sample_starts(recording, label, windows, samples, seed)
-    return SampleSet(
-        cut_windows(recording, starts, windows),
-        classes,
-        np.zeros(len(starts), np.int64),
-        starts,
-        (trial,),
-    )
-
-
-def span_samples(
-    recording: Recording,
-    label: TrialLabel,
-    trial: TrialId,
-    windows: Windows,
-    most: int,
-    classes: tuple[str, ...],
-    seed: int,
-) -> SampleSet:
-    """The samples of one trial whose label gives classes of its parts.
+def span_starts(
+    label: TrialLabel, windows: Windows, most: int, classes: tuple[str, ...], seed: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Start of each window that is a sample, ns, and its class, of a label with classes of parts.
 
     Windows lie one after the other in each part. Of a class that has more than `most` of them so
     many are drawn.
@@ -223,15 +192,11 @@ def span_samples(
     Args:
         classes: names of the classes, whose places are the samples' classes.
         seed: of the draw (PCG64).
-
-    Returns:
-        the samples; ``y`` runs from 0 to ``len(classes) - 1``.
     """
     length_ns = windows.length_ms * 1_000_000
     starts: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
-    of_class: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
     rng = np.random.Generator(np.random.PCG64(seed))
-    for number, name in enumerate(classes):
+    for name in classes:
         there = [
             consecutive_windows(span.start_ns, span.end_ns, length_ns)
             for span in label.spans
@@ -241,15 +206,32 @@ def span_samples(
         if len(found) > most:
             found = np.sort(rng.choice(found, most, replace=False))
         starts.append(found)
-        of_class.append(np.full(len(found), number, np.int64))
-    begins = np.concatenate(starts)
-    return SampleSet(
-        cut_windows(recording, begins, windows),
-        np.concatenate(of_class),
-        np.zeros(len(begins), np.int64),
-        begins,
-        (trial,),
-    )
+    return np.concatenate(starts), np.repeat(np.arange(len(classes)), [*map(len, starts[1:])])
+
+
+def trial_samples(
+    recording: Recording,
+    label: TrialLabel,
+    trial: TrialId,
+    windows: Windows,
+    samples: SampleSettings,
+    seed: int,
+    classes: tuple[str, ...] = (),
+) -> SampleSet:
+    """The samples of one trial by the paper's rule, or those of classes.
+
+    Args:
+        label: the trial's, for its onsets or the classes of its parts.
+        trial: what the samples carry.
+        seed: of the random windows within incipient slip, or of a class.
+        classes: names of the classes where these are not slip's; see `span_starts`.
+    """
+    if classes:
+        starts, y = span_starts(label, windows, samples.per_class, classes, seed)
+    else:
+        starts, y = sample_starts(recording, label, windows, samples, seed)
+    trials = np.zeros(len(starts), np.int64)
+    return SampleSet(cut_windows(recording, starts, windows), y, trials, starts, (trial,))
 
 
 def run_starts(
@@ -266,9 +248,8 @@ def run_starts(
 
 
 def trial_windows(
-    recording: Recording, windows: Windows
+    recording: Recording, windows: Windows, stride_ms: int | None = None
 ) -> tuple[SparseWindows, npt.NDArray[np.int64]]:
-    """All consecutive windows of a recording: samples, and the end of each on the time line, ns."""
-    length_ns = windows.length_ms * 1_000_000
-    starts = consecutive_windows(*recorded_span(recording), length_ns)
-    return cut_windows(recording, starts, windows), starts + length_ns
+    """Samples of the windows of `run_starts`, and the end of each on the time line, ns."""
+    starts = run_starts(recording, windows, stride_ms)
+    return cut_windows(recording, starts, windows), starts + windows.length_ms * 1_000_000

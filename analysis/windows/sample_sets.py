@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sliplab.analysis.campaigns import Collected, agreeing, class_names, training_campaigns
+from sliplab.analysis.campaigns import Collected, agreeing, training_campaigns
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import EachTrial, TrialWork, in_order
 from sliplab.analysis.windows import dataset
@@ -67,38 +67,19 @@ def several(campaigns: list[Collected]) -> list[str]:
 
 
 def load_samples(
-    labels: StoreLabels, campaigns: list[Collected], split: str, each: EachTrial = in_order
-) -> SampleSet:
-    """Load the samples of all trials of one split of the kinematic campaigns, memory-mapped.
-
-    Args:
-        each: makes what is missing; in this process a trial takes 10 ms.
-    """
-    return _load(labels, training_campaigns(campaigns), split, each, ())
-
-
-def load_class_samples(
     labels: StoreLabels,
     campaigns: list[Collected],
     split: str,
     each: EachTrial = in_order,
-    classes: tuple[str, ...] | None = None,
+    classes: tuple[str, ...] = (),
 ) -> SampleSet:
-    """Load the samples of all trials of one split of campaigns of classes; see `load_samples`.
+    """Load the samples of all trials of one split, memory-mapped.
 
     Args:
-        classes: names of the classes; by default those that the campaigns' adapters list.
+        each: makes what is missing; in this process a trial takes 10 ms.
+        classes: that the recordings show; by default slip, in the kinematic campaigns.
     """
-    return _load(labels, agreeing(campaigns), split, each, classes or class_names(campaigns))
-
-
-def _load(
-    labels: StoreLabels,
-    used: list[Collected],
-    split: str,
-    each: EachTrial,
-    classes: tuple[str, ...],
-) -> SampleSet:
+    used = agreeing(campaigns) if classes else training_campaigns(campaigns)
     windows = used[0].settings.windows
     trials = [(item, trial, found) for item in used for trial, found in item.of_split(split)]
     inputs = [
@@ -151,16 +132,4 @@ def _make(
 
 
 def _samples(recording: Recording, inputs: _SampleInputs) -> SampleSet:
-    if inputs.classes:
-        return dataset.span_samples(
-            recording,
-            inputs.label,
-            inputs.trial,
-            inputs.windows,
-            inputs.samples.per_class,
-            inputs.classes,
-            inputs.seed,
-        )
-    return dataset.trial_samples(
-        recording, inputs.label, inputs.trial, inputs.windows, inputs.samples, inputs.seed
-    )
+    return dataset.trial_samples(recording, **vars(inputs))

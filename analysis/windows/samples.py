@@ -25,9 +25,7 @@ def consecutive_windows(start_ns: int, end_ns: int, window_ns: int) -> NDArray[n
     Raises:
         ValueError: the window is not positive.
     """
-    if window_ns <= 0:
-        raise ValueError(f"window_ns = {window_ns}: must be positive")
-    return _run(start_ns, max(0, end_ns - start_ns) // window_ns, window_ns)
+    return strided_windows(start_ns, end_ns, window_ns, window_ns)
 
 
 def strided_windows(

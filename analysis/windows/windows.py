@@ -108,29 +108,6 @@ def list_events(
     return SparseWindows(shape, offsets, cell[: offsets[-1]].copy(), count[: offsets[-1]].copy())
 
 
-def window_totals(
-    events: EventChunk,
-    starts_us: NDArray[np.int64],
-    settings: Windows,
-    width: int = 640,
-    height: int = 480,
-    centre_px: tuple[float, float] | None = None,
-) -> NDArray[np.int64]:
-    """Events of each window that `bin_events` would count, without its limit of 255.
-
-    Arguments and errors as there; returns (n,) int64.
-    """
-    columns = _columns(events)
-    starts = _times(starts_us, "starts_us")
-    of_x, of_y = _cells(settings, width, height, centre_px)
-    out = np.zeros(starts.size, np.int64)
-    state = _total(
-        *columns, starts, settings.length_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
-    )
-    _raise_for_status(state, columns, width, height)
-    return out
-
-
 _CODES = {"negative": 0, "positive": 1, "both": 2}
 
 _Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8], NDArray[np.int64]]
@@ -336,31 +313,4 @@ def _list(
                 plane[touched[k]] = 0
                 e += 1
             offsets[n * steps + step + 1] = e
-    return 0
-
-
-@njit(cache=True, nogil=True)
-def _total(
-    x: Any,
-    y: Any,
-    p: Any,
-    t: Any,
-    starts: Any,
-    length_us: int,
-    polarity: int,
-    of_x: Any,
-    of_y: Any,
-    out: Any,
-) -> int:
-    state = _fault(x, y, t, of_x.size, of_y.size)
-    if state != 0:
-        return state
-    for n in range(starts.size):
-        total = 0
-        stop = np.searchsorted(t, starts[n] + length_us)
-        for i in range(np.searchsorted(t, starts[n]), stop):
-            inside = of_x[x[i]] >= 0 and of_y[y[i]] >= 0
-            selected = polarity == 2 or (p[i] != 0) == (polarity == 1)
-            total += inside and selected
-        out[n] = total
     return 0

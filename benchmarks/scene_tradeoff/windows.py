@@ -16,7 +16,7 @@ import numpy as np
 
 from sliplab.analysis.metrics.classification import CLASSES, NO_SLIP
 from sliplab.analysis.windows.samples import choose_windows
-from sliplab.analysis.windows.windows import window_totals
+from sliplab.analysis.windows.windows import list_events
 from sliplab.plugins.simulation.scene_runs import SceneRun
 from sliplab.protocols.windows import SampleSettings, Windows
 
@@ -59,8 +59,8 @@ def look(seen: SceneRun, windows: Windows, samples: SampleSettings, seed: int) -
     )
     silent = []
     for name in sorted(chosen):
-        totals = window_totals(seen.events, chosen[name] // 1000, windows, *seen.size_px)
-        silent.append(int(np.count_nonzero(totals == 0)))
+        found = list_events(seen.events, chosen[name] // 1000, windows, *seen.size_px)
+        silent.append(int(np.count_nonzero(found.totals == 0)))
     in_hold = np.count_nonzero(chosen[NO_SLIP] + windows.length_ms * 1_000_000 <= 0)
     incipient, gross = (end_ns if onset is None else onset for onset in seen.markers)
     borders = np.array([begin_ns, 0, incipient, gross, end_ns]) // 1000

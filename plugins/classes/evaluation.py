@@ -22,7 +22,7 @@ from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
 from sliplab.analysis.networks.baselines import (
-    evaluate_baselines,
+    cheap_votes,
     logistic_cells,
     logistic_slices,
 )
@@ -269,8 +269,7 @@ def _beside(
     classes: Sequence[str], parts: Mapping[str, SampleSet], counts: I64
 ) -> dict[str, Baseline]:
     train, test = parts["train"], parts["test"]
-    cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y, classes)
-    votes = {name: score.votes for name, score in cheap.items()}
+    votes = cheap_votes(train.windows, train.y, test.windows, len(classes))
     for name, fit in (("logistic_cells", logistic_cells), ("logistic_slices", logistic_slices)):
         votes[name], _ = fit(train.windows, train.y, test.windows, len(classes))
     return {name: compared(each, counts, test.y, test.trial) for name, each in votes.items()}

@@ -8,12 +8,12 @@ from dataclasses import replace
 from sliplab.analysis.campaigns import Collected, agreeing, class_names, of_classes
 from sliplab.analysis.evaluation.baselines import Methods
 from sliplab.analysis.labels.reviewed import StoreLabels
-from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_class_models
+from sliplab.analysis.networks.models import ModelOnDisk, choose_model, wanted_models
 from sliplab.analysis.problem import EventProblem, Workers
 from sliplab.analysis.report import pages
 from sliplab.analysis.trial_work import EachTrial, in_order
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.sample_sets import load_class_samples
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.plugins.classes import evaluation, report
 from sliplab.plugins.classes.baselines import class_methods
 from sliplab.protocols.errors import InputError
@@ -39,11 +39,13 @@ class ClassesOfRecordings(EventProblem):
 
     def models(self) -> list[ModelOnDisk]:
         """See `Problem`."""
-        return wanted_class_models(self.labels, self.campaigns, self.classes())
+        return wanted_models(
+            self.labels.store, self.campaigns, self.labels.reviewed, self.classes()
+        )
 
     def samples(self, split: str, each: EachTrial = in_order) -> SampleSet:
         """See `Problem`."""
-        return load_class_samples(self.labels, self.campaigns, split, each, self.classes())
+        return load_samples(self.labels, self.campaigns, split, each, self.classes())
 
     def job(self, margin: float | None, smoothing: int | None) -> evaluation.ClassJob:
         """See `Problem`.

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.evaluation.trials import latencies
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
@@ -27,18 +26,13 @@ from sliplab.analysis.networks.models import (
     wanted_models,
 )
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED
-from sliplab.analysis.networks.quantised import (
-    Quantised,
-    chip_run,
-    compare,
-    quantise,
-    quantised_net,
-)
+from sliplab.analysis.networks.quantised import Quantised, quantise
 from sliplab.analysis.networks.synaptic import count_work
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
+from sliplab.plugins.deploy.chip import chip_run, compare, latencies, quantised_net, rounding
 from sliplab.plugins.deploy.document import (
     CardCampaign,
     CardData,
@@ -157,12 +151,12 @@ def _speck(
     margin = source.margin
     ran = chip_run(quantised_net(fitted, whole), seen.x)
     counts = fitted.engine.counts(seen.windows)
-    rounding = whole.rounding(net)
+    errors = rounding(whole, net)
     layers = {
         name: QuantisedLayer(
             scale=whole.scales[name],
             threshold=whole.thresholds[spiking],
-            rounding=rounding[name],
+            rounding=errors[name],
             potential=ran.potentials[spiking],
             saturated=ran.saturated[spiking],
         )

@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.networks.quantised import STATE_BITS, WEIGHT_BITS
+from sliplab.analysis.networks.quantised import WEIGHT_BITS
 from sliplab.plugins.deploy.card import latency_table, percent, table
+from sliplab.plugins.deploy.chip import STATE_BITS
 from sliplab.plugins.deploy.document import (
     ChipCore,
     ChipFit,

@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from sliplab.analysis.campaigns import collected
-from sliplab.analysis.labels.event_labels import EventOnsets, onsets_by_events
+from sliplab.analysis.labels.event_labels import onsets_by_events
+from sliplab.analysis.labels.label import Label
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
@@ -84,11 +85,11 @@ def thinned(share: float, from_s: float, to_s: float) -> Callable[[EventChunk, i
     return change
 
 
-def by_events(recording: Any) -> EventOnsets:
+def by_events(recording: Any) -> Label:
     return onsets_by_events(recording, Labelling())
 
 
-def errors_ms(recording: Recording, found: EventOnsets) -> dict[str, float]:
+def errors_ms(recording: Recording, found: Label) -> dict[str, float]:
     """Onsets of the paper's rule less the true crossings, of those that are not in doubt."""
     truth = recording.simulation_truth()
     assert truth is not None
@@ -108,8 +109,8 @@ def test_onsets_are_within_their_interval_and_close_to_those_from_frames(
         found, frames = by_events(recording), label_recording(recording, Labelling())
         truth = recording.simulation_truth() or {}
         for kind, error in errors_ms(recording, found).items():
-            interval = found.intervals[KINDS.index(kind)]
-            assert interval.low_ns <= truth[f"{kind}_ns"] <= interval.high_ns
+            low, high = getattr(found.intervals, f"{kind}_ns")
+            assert low <= truth[f"{kind}_ns"] <= high
             assert abs(error) < 100.0
             seen = getattr(frames.paper, f"{kind}_ns")
             assert abs(getattr(found.paper, f"{kind}_ns") - seen) / 1e6 < 110.0
@@ -129,15 +130,18 @@ def test_tracks_are_near_the_truth(slides: list[Recording]) -> None:
     for recording in slides:
         found, frames = by_events(recording), label_recording(recording, Labelling())
         seen = np.stack(
-            [np.interp(found.t_ns, frames.frame_ns, column) for column in frames.displacement_px.T],
+            [
+                np.interp(found.frame_ns, frames.frame_ns, column)
+                for column in frames.displacement_px.T
+            ],
             axis=1,
         )
-        moving = (found.t_ns > frames.start_ns)[:, None] & (seen < 4.0)
+        moving = (found.frame_ns > frames.start_ns)[:, None] & (seen < 4.0)
         off = (found.displacement_px - seen)[moving]
         # a px is 0.05 mm
         assert np.nanmedian(np.abs(off)) < 0.4
         assert np.nanquantile(np.abs(off), 0.95) < 1.6
-        z = (np.abs(off) / found.sigma_px[moving])[np.isfinite(off)]
+        z = (np.abs(off) / found.places.sigma[moving])[np.isfinite(off)]
         assert (z < 3.0).mean() > 0.9
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from sliplab.analysis.labels.labelling import Label, label_recording
+from sliplab.analysis.labels.label import Label
+from sliplab.analysis.labels.labelling import label_recording
 from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import OnsetDoubts
 from sliplab.storage.trials.recording import Recording

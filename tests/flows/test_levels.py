@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from sliplab.analysis.labels.labelling import Label, label_recording
+from sliplab.analysis.labels.label import Label
+from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.trials.checksums import write_sums
 from sliplab.storage.trials.recording import Recording

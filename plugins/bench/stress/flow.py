@@ -185,7 +185,7 @@ def _predicted(
         for _, recording, it in trials
     ]
     keep = spike_keeper(disturbed, None)
-    predict_trials(disturbed, model.path, windows, [each for _, each in wanted], keep)
+    predict_trials(disturbed, model.path, [each for _, each in wanted], keep)
     found = []
     for it, each in wanted:
         arrays = Derived.of(disturbed, each.step, each.campaign).arrays(each.recording.folder.name)

@@ -21,12 +21,13 @@ import numpy.typing as npt
 import pandas as pd
 
 from sliplab.analysis.detectors.latency import NEVER, true_slip
-from sliplab.analysis.detectors.rule_sweep import Trials, choose_pair, score, sweep
-from sliplab.analysis.metrics.paired import paired_difference
-from sliplab.analysis.metrics.pareto import front
+from sliplab.analysis.detectors.rule_sweep import Trials, choose_pair, sweep
 from sliplab.analysis.sweeps.runner import Arrays
 from sliplab.plugins.studies.detector.document import BySeed, DetectorRow, DetectorTradeoff, mean
 from sliplab.plugins.studies.detector.grid import PAPER, NetworkSetting, counted_stride, strides
+from sliplab.plugins.studies.detector.pair_scores import score
+from sliplab.plugins.studies.detector.paired import paired_difference
+from sliplab.plugins.studies.detector.pareto import front
 from sliplab.plugins.studies.detector.search import (
     PRECISIONS,
     DetectorSearch,

@@ -35,7 +35,6 @@ from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.analysis.sweeps.runner import Advance, Arrays, Sweep
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.studies.detector.grid import NetworkSetting, SettingGrid, counted_stride
 from sliplab.protocols import Trial
@@ -412,13 +411,11 @@ class DetectorSearch:
         self, recording: Recording, engine: SpikeEngine, windows: Windows
     ) -> tuple[npt.NDArray[np.uint16], int]:
         """Return spike counts of a trial at the finest stride, and the end of the first window."""
-        length_ns = windows.length_ms * 1_000_000
-        stride_ns = counted_stride(windows.length_ms, self.size.stride_ms) * 1_000_000
-        span = dataset.recorded_span(recording)
-        starts = strided_windows(*span, length_ns, stride_ns)
-        counts = engine.counts(dataset.cut_windows(recording, starts, windows))
+        stride_ms = counted_stride(windows.length_ms, self.size.stride_ms)
+        x, _ = dataset.trial_windows(recording, windows, stride_ms)
+        first_ns = dataset.recorded_span(recording)[0] + windows.length_ms * 1_000_000
         # at most 1000 steps of 64 neurons
-        return counts.astype(np.uint16), span[0] + length_ns
+        return engine.counts(x).astype(np.uint16), first_ns
 
 
 def network_of(fitted: Fitted, precision: str) -> nn.Sequential | str:

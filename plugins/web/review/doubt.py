@@ -274,7 +274,7 @@ def _crossed(store: Store, case: ReviewedTrial) -> dict[Kind, tuple[int, int] | 
         settings.threshold_px,
         start_ns - 1,
     )
-    return dict(zip(KINDS, found, strict=True))
+    return {"incipient": found.incipient_ns, "gross": found.gross_ns}
 
 
 def _marker_onsets(found: RuleOnsets) -> MarkerOnsets:

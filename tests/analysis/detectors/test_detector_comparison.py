@@ -14,14 +14,14 @@ from sliplab.analysis.detectors.detectors import Predictions, TrialWithSlip
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.analysis.detectors.onset_references import OnsetReference, References
 from sliplab.protocols.detection import ComparisonSettings, Detection
-from sliplab.protocols.windows import Windows
+from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import DetectorComparison, PartTrials
 
 MS = 1_000_000
-WINDOWS = Windows()
-SETTINGS = Detection(
+DETECTION = Detection(
     smoothing_grid=(1, 4), compare=ComparisonSettings(rates=(0.0, 0.2), train_trials=9)
 )
+SETTINGS = AnalysisSettings(detection=DETECTION)
 
 
 def trial(seed: int, stride: int) -> TrialWithSlip:
@@ -52,7 +52,7 @@ def parts(validation: int = 10, test: int = 10) -> Parts:
 
 @pytest.fixture(scope="module")
 def compared() -> dict[str, object]:
-    found = compare(parts(), WINDOWS, SETTINGS, 10, WINDOWS.steps)
+    found = compare(parts(), SETTINGS, DETECTION)
     assert found is not None
     return found
 
@@ -90,7 +90,7 @@ def test_what_adds_up_evidence_beats_the_average_here(compared: DetectorComparis
 
 def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparison) -> None:
     one = Parts(parts().train, parts().validation, [trial(900, 10)])
-    other = compare(one, WINDOWS, SETTINGS, 10, WINDOWS.steps)
+    other = compare(one, SETTINGS, DETECTION)
     for mine, theirs in zip(compared.detectors, other.detectors, strict=True):
         for a, b in zip(mine.rates, theirs.rates, strict=True):
             assert (a.levels, a.choice, a.validation) == (b.levels, b.choice, b.validation)
@@ -106,7 +106,7 @@ def test_other_onsets_judge_and_decide_nothing(compared: DetectorComparison) -> 
 
     of = parts()
     judged = Parts(seen(of.train), seen(of.validation), seen(of.test))
-    found = compare(judged, WINDOWS, SETTINGS, 10, WINDOWS.steps)
+    found = compare(judged, SETTINGS, DETECTION)
     for mine, theirs in zip(found.detectors, compared.detectors, strict=True):
         assert mine.curve == theirs.curve
         for a, b in zip(mine.rates, theirs.rates, strict=True):
@@ -124,7 +124,10 @@ def test_one_stride_is_compared_once() -> None:
         parts().train,
         *([thinned(t, 3) for t in p] for p in (parts(3, 3).validation, parts(3, 3).test)),
     )
-    found = compare(few, WINDOWS, SETTINGS, 30, WINDOWS.steps)
+    detection = DETECTION.model_copy(
+        update={"compare": ComparisonSettings(rates=(0.0, 0.2), train_trials=9, stride_ms=30)}
+    )
+    found = compare(few, AnalysisSettings(detection=detection), detection)
     assert found.strides_ms == (30,)
     assert len(found.detectors) == 8
 
@@ -140,7 +143,7 @@ def test_thinned_windows_are_the_consecutive_ones() -> None:
 def test_nothing_to_compare(missing: str) -> None:
     there = copy.copy(vars(parts(2, 2)))
     if missing == "compare":
-        assert compare(Parts(**there), WINDOWS, Detection(compare=None), 10, WINDOWS.steps) is None
+        assert compare(Parts(**there), SETTINGS, Detection(compare=None)) is None
         return
     there[missing] = []
-    assert compare(Parts(**there), WINDOWS, SETTINGS, 10, WINDOWS.steps) is None
+    assert compare(Parts(**there), SETTINGS, DETECTION) is None

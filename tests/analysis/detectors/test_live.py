@@ -71,7 +71,7 @@ def detector(
 
 def open_windows(live: LiveDetector) -> int:
     assert isinstance(live._detector, NetworkDetector)
-    return live._detector.open_windows
+    return len(live._detector._open)
 
 
 def events(t_us: list[int] | npt.NDArray[np.int64], seed: int = 0) -> EventChunk:

@@ -14,22 +14,19 @@ from scipy.spatial.distance import pdist
 from sliplab.analysis.labels.blobs import Floats, Frame, find_blobs, match_layout
 
 
-def reference_track(
-    frames: Iterable[Frame], layout_px: Floats, *, threshold: int | None = None
-) -> Floats:
+def reference_track(frames: Iterable[Frame], layout_px: Floats) -> Floats:
     """(n, m, 2) px, NaN where a marker has no blob.
 
     Args:
         frames: (h, w) uint8, in order.
         layout_px: (m, 2) nominal positions relative to the centre marker.
-        threshold: grey level; Otsu's by default, frame by frame.
     """
     layout = np.array(layout_px, np.float64)
     spacing = float(pdist(layout).min()) if len(layout) > 1 else 100.0
     limits = (np.pi * (0.15 * spacing) ** 2, np.pi * (0.5 * spacing) ** 2)
     last, rows = layout, []
     for frame in frames:
-        blobs = find_blobs(frame, threshold, *limits)
+        blobs = find_blobs(frame, *limits)
         shift, index = match_layout(blobs.xy, last, 0.35 * spacing)
         found = np.full(layout.shape, np.nan)
         seen = index >= 0

@@ -6,9 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, doubts, uncertain
+from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, uncertain, unseen
 from sliplab.analysis.labels.onsets import paper_onsets
 from sliplab.protocols.labelling import Labelling
+from sliplab.storage.schema.label import OnsetDoubts
 
 FRAME_NS = 10_000_000
 RULE = Labelling(threshold_px=2.0)
@@ -22,11 +23,17 @@ def moved() -> tuple[np.ndarray, np.ndarray]:
     return frames * FRAME_NS, np.where(frames[:, None] >= SLIPS, 3.0, 0.1)
 
 
+def doubts(frame_ns: np.ndarray, distance: np.ndarray) -> OnsetDoubts:
+    """Doubts about the onsets by the paper's rule."""
+    onsets = paper_onsets(frame_ns, distance, 0, RULE, START)
+    return unseen(frame_ns, distance, onsets, 0, START)
+
+
 def hidden(marker: int, first: int, last: int) -> tuple[str | None, str | None]:
     """Doubts when a marker is unseen from one frame up to and without another."""
     frame_ns, distance = moved()
     distance[first:last, marker] = np.nan
-    found = doubts(frame_ns, distance, 0, RULE, START)
+    found = doubts(frame_ns, distance)
     return found.incipient, found.gross
 
 
@@ -69,9 +76,9 @@ def test_without_the_centre_gross_slip_is_unknown() -> None:
 def test_a_centre_that_did_not_slip_is_known_not_to_have() -> None:
     frame_ns, distance = moved()
     distance[:, 0] = 0.1
-    assert doubts(frame_ns, distance, 0, RULE, START).gross is None
+    assert doubts(frame_ns, distance).gross is None
     distance[-4:, 0] = np.nan
-    assert doubts(frame_ns, distance, 0, RULE, START).gross is not None
+    assert doubts(frame_ns, distance).gross is not None
 
 
 @given(
@@ -85,7 +92,7 @@ def test_an_onset_is_right_within_three_frames_or_in_doubt(
     frame_ns, distance = moved()
     distance[first : first + length, marker] = np.nan
     onsets = paper_onsets(frame_ns, distance, 0, RULE, START)
-    found = doubts(frame_ns, distance, 0, RULE, START)
+    found = doubts(frame_ns, distance)
     if found.incipient is None:
         assert abs(onsets.incipient_ns - 50 * FRAME_NS) <= MAX_UNSEEN_NS
     if found.gross is None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.labels.labelling import Label, label_places
+from sliplab.analysis.labels.label import Label
+from sliplab.analysis.labels.labelling import label_places
 from sliplab.analysis.labels.places import Places
 from sliplab.analysis.labels.plate_tracking import PlateTrack
 from sliplab.protocols.labelling import Labelling

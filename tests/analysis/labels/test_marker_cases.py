@@ -6,9 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from sliplab.analysis.labels.markers import MarkerTracks, track
+from sliplab.analysis.labels.markers import MarkerTracks
 from tests.analysis.labels.reference_tracks import reference_track
-from tests.analysis.labels.test_markers import CENTRE, LAYOUT, RADIUS, SIZE, draw, still, video
+from tests.analysis.labels.test_markers import (
+    CENTRE,
+    LAYOUT,
+    RADIUS,
+    SIZE,
+    draw,
+    still,
+    track,
+    video,
+)
 
 GLIDE = np.arange(40)[:, None, None] * np.array([0.31, -0.17])
 

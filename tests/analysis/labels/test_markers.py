@@ -7,13 +7,18 @@ import pytest
 from numpy.typing import NDArray
 
 from sliplab.analysis.labels.blobs import find_blobs, match_layout
-from sliplab.analysis.labels.markers import MarkerTracker, track
+from sliplab.analysis.labels.markers import MarkerTracker, MarkerTracks
+from sliplab.analysis.labels.plate_tracking import track_video
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 
 SIZE = (560, 560)
 CENTRE = np.array([280.0, 280.0])
+
+
+def track(frames: list[Frame], layout_px: Floats) -> MarkerTracks:
+    return track_video(frames, layout_px, with_plate=False).markers
 
 
 def skin(px_per_mm: float) -> Floats:

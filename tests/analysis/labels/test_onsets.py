@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sliplab.analysis.labels.onsets import displacements, paper_onsets, rest_time
+from sliplab.analysis.labels.onsets import (
+    mean_positions,
+    paper_onsets,
+    relative_to_plate,
+    rest_time,
+)
 from sliplab.protocols.labelling import Labelling
 
 MS = 1_000_000
@@ -34,6 +39,12 @@ def moved(displacement: Floats) -> Floats:
     direction = np.stack((np.cos(angle), np.sin(angle)), axis=-1)
     home = np.stack((300 + 67 * np.arange(len(angle)), 200 - 5 * np.arange(len(angle))), axis=-1)
     return home + displacement[:, :, None] * direction
+
+
+def displacements(xy: Floats, rest: object, plate_xy: Floats | None = None) -> Floats:
+    """Distance of each marker from its mean place over the frames at rest, (n, m) px."""
+    xy = relative_to_plate(xy, plate_xy)
+    return np.hypot(*np.moveaxis(xy - mean_positions(xy, rest), -1, 0))
 
 
 def test_the_rule_read_literally() -> None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from sliplab.analysis.labels import plate_tracking
 from sliplab.analysis.labels.blobs import find_blobs
-from sliplab.analysis.labels.markers import track
 from sliplab.analysis.labels.plate_tracking import (
     MAX_BRIDGED,
     PlatePose,
@@ -167,7 +166,6 @@ def test_a_video_in_one_pass() -> None:
     assert np.abs(tracks.plate.xy - plates).max() < 0.2
     assert np.abs(tracks.markers.xy - markers).max() < 0.1
     # the same as each alone
-    np.testing.assert_array_equal(tracks.markers.xy, track(frames, layout).xy)
     np.testing.assert_array_equal(tracks.plate.corners, track_plate(frames).corners)
     without = plate_tracking.track_video(frames, layout, with_plate=False)
     assert without.plate is None

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.networks import quantised
 from sliplab.analysis.networks.network import SPIKING, build, weights
-from sliplab.analysis.networks.quantised import chip_run, common_net, common_threshold, quantise
+from sliplab.analysis.networks.quantised import common_net, common_threshold, quantise
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import Fitted
+from sliplab.plugins.deploy.chip import chip_run, quantised_net
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
@@ -46,7 +46,7 @@ def test_spikes_are_those_of_the_chips_arithmetic(seed: int) -> None:
     whole = quantise(build(network, WINDOWS, seed))
     assert len({whole.thresholds[name] for name in SPIKING}) > 1
     x = np.random.default_rng(seed).poisson(0.5, (80, 12, 1, 7, 7)).astype(np.uint8)
-    expected = chip_run(quantised.quantised_net(fitted, whole), x)
+    expected = chip_run(quantised_net(fitted, whole), x)
     assert set(expected.saturated.values()) == {0.0}
     assert expected.counts.sum() > 0
     assert np.array_equal(SpikeEngine(common_net(fitted, whole), 7).counts(x), expected.counts)

@@ -153,9 +153,8 @@ def test_extremes(data: st.DataObject) -> None:
     np.testing.assert_array_equal(engine.counts(x), expected)
     one_by_one = np.concatenate([spike_counts(net, x[k : k + 1]) for k in range(len(x))])
     np.testing.assert_array_equal(one_by_one, expected)
-    stream = engine.stream()
     for sample, total in zip(x, expected, strict=True):
-        stream.reset()
+        stream = engine.stream()
         steps = np.array([stream.push(plane) for plane in sample])
         np.testing.assert_array_equal(steps.sum(axis=0), total)
 

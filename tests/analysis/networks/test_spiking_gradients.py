@@ -19,7 +19,7 @@ from sliplab.analysis.networks.network import (
     parameters,
     reset_states,
 )
-from sliplab.analysis.networks.spiking import GradientJob, Trainer, WindowLoss
+from sliplab.analysis.networks.spiking import Trainer
 from sliplab.analysis.networks.spiking_gradients import _through
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.network_settings import NetworkSettings
@@ -62,12 +62,11 @@ def by_events(
     net: nn.Sequential, x: np.ndarray, y: torch.Tensor, cells: int, gain: float = 1.0
 ) -> tuple[torch.Tensor, list[np.ndarray]]:
     trainer = Trainer(net, cells)
-    job = GradientJob(trainer, SparseWindows.of(x), np.arange(len(x)), y.numpy(), gain)
-    loss = WindowLoss.apply(job, *trainer.leaves) / len(x)
-    grads = torch.autograd.grad(loss, trainer.leaves)
-    counts = torch.from_numpy(job.counts)
-    torch.testing.assert_close(loss, nn.functional.cross_entropy(gain * counts.double(), y))
-    return counts, trainer.layout.unpack([grad.numpy() for grad in grads])
+    found = trainer.gradients(SparseWindows.of(x), np.arange(len(x)), y.numpy(), gain)
+    counts = torch.from_numpy(found.counts)
+    expected = nn.functional.cross_entropy(gain * counts.double(), y)
+    assert found.loss / len(x) == pytest.approx(expected.item())
+    return counts, trainer.layout.unpack([grad / len(x) for grad in found.grads])
 
 
 class _Spike(torch.autograd.Function):

@@ -394,15 +394,6 @@ def test_a_record_of_counts() -> None:
     assert found.val_loss == pytest.approx((2 * right + np.log(3) + wrong) / 4)
 
 
-def test_strict_accuracy_decides_then_argmax_then_loss() -> None:
-    better = [
-        replace(RECORD, val_strict=0.81, val_argmax=0.1, val_loss=9.0),
-        replace(RECORD, val_argmax=0.91, val_loss=9.0),
-        replace(RECORD, val_loss=0.2),
-    ]
-    assert all(other.merit > RECORD.merit for other in better)
-
-
 def test_saturated_and_silent_layers_are_named() -> None:
     assert training.layer_warnings(RECORD) == ()
     found = training.layer_warnings(replace(RECORD, rates={**RATES, "iaf2": 0.95, "iaf4": 0.0}))

@@ -21,7 +21,7 @@ from sliplab.analysis.report.figures.intervals import (
     differences,
 )
 from sliplab.analysis.report.outcomes import FailureSection
-from sliplab.analysis.report.page import Content, Figure, Table, csv_text
+from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
 from sliplab.analysis.report.trial import TrialSection
 from sliplab.plugins.studies.generalise.section import SkinSection
 from sliplab.plugins.studies.plot import AxisPair as Pair
@@ -92,7 +92,9 @@ def render(*sections: Content, simulated: bool = False, notices: Sequence[str] =
     """A report with these sections."""
     campaigns: Any = [SimpleNamespace(name=EVIL, title=EVIL, question=EVIL)]
     cover = Cover("report.html", Answer([EVIL], Figure(SVG), EVIL), notices, [])
-    return cover.render(campaigns, sections, simulated=simulated)
+    return render_page(
+        cover.template, sections, simulated=simulated, campaigns=campaigns, cover=cover
+    )
 
 
 @pytest.mark.quick(3)

@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.analysis.campaigns import Collected, class_names, collected, of_classes
 from sliplab.analysis.labels.reviewed import StoreLabels
-from sliplab.analysis.windows.sample_sets import load_class_samples
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import label
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store, StoreError
@@ -50,7 +50,7 @@ def test_windows_lie_in_their_part_and_are_drawn_where_there_are_more(item: Coll
     assert class_names(campaigns) == ("9", "10")
     assert label(store, campaigns)["done"] == 3
     labels = StoreLabels(store)
-    train = load_class_samples(labels, campaigns, "train")
+    train = load_samples(labels, campaigns, "train", classes=("9", "10"))
     by_name = {
         (train.trials[k].trial, int(y)): np.sort(
             train.start_ns[(train.trial == k) & (train.y == y)]
@@ -65,10 +65,10 @@ def test_windows_lie_in_their_part_and_are_drawn_where_there_are_more(item: Coll
     assert set(drawn.tolist()) <= set(range(0, 1000 * MS, 100 * MS))
     assert train.windows.shape == (2, 8, 1, 1)
     assert train.windows.totals.tolist() == [10] * len(train)
-    again = load_class_samples(labels, campaigns, "train")
+    again = load_samples(labels, campaigns, "train", classes=("9", "10"))
     np.testing.assert_array_equal(again.start_ns, train.start_ns)
     # 90 ms hold no window: the trial is there, without samples
-    test = load_class_samples(labels, campaigns, "test")
+    test = load_samples(labels, campaigns, "test", classes=("9", "10"))
     assert (len(test), [name.trial for name in test.trials]) == (0, ["none"])
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sliplab.analysis.windows.windows import bin_events, first_pixel, list_events, window_totals
+from sliplab.analysis.windows.windows import bin_events, first_pixel, list_events
 from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import EventChunk
 
@@ -88,8 +88,6 @@ def test_counts_are_the_naive_histogram(
     assert got.shape == (5, how.steps, how.channels, how.cells, how.cells)
     assert got.dtype == np.uint8
     np.testing.assert_array_equal(got, np.minimum(expected, 255))
-    totals = window_totals(EventChunk(*columns), starts, how, width, height)
-    np.testing.assert_array_equal(totals, expected.sum(axis=(1, 2, 3, 4)))
 
 
 @pytest.mark.parametrize(
@@ -145,11 +143,10 @@ def test_polarities() -> None:
     assert bin_events(EventChunk(*two), np.array([0]), PAPER).sum() == 1
 
 
-def test_counts_saturate_and_totals_do_not() -> None:
+def test_counts_saturate() -> None:
     k = 1_000
     columns = (np.full(k, 320), np.full(k, 240), np.ones(k, np.int8), np.zeros(k, np.int64))
     assert bin_events(EventChunk(*columns), np.array([0]), PAPER).max() == 255
-    assert window_totals(EventChunk(*columns), np.array([0]), PAPER).tolist() == [k]
 
 
 def test_no_events_and_no_windows() -> None:
@@ -158,7 +155,6 @@ def test_no_events_and_no_windows() -> None:
     assert bin_events(EventChunk(*none, times), np.array([0, 5]), PAPER).shape == (2, 30, 1, 20, 20)
     assert not bin_events(EventChunk(*none, times), np.array([0]), PAPER).any()
     assert bin_events(EventChunk(*none, times), times, PAPER).shape[0] == 0
-    assert window_totals(EventChunk(*none, times), times, PAPER).shape == (0,)
 
 
 def test_read_only_and_strided_columns() -> None:
@@ -185,7 +181,7 @@ def test_bad_columns_are_named() -> None:
         with pytest.raises(ValueError, match=said):
             bin_events(EventChunk(*columns), start, PAPER)
     with pytest.raises(ValueError, match=r"event 1 at pixel \(640, 300\): outside 640 x 480"):
-        window_totals(EventChunk(np.array([300, 640]), y, p, t), start, PAPER)
+        bin_events(EventChunk(np.array([300, 640]), y, p, t), start, PAPER)
     with pytest.raises(ValueError, match="larger than the sensor"):
         bin_events(EventChunk(x, y, p, t), start, PAPER, 300, 300)
     for bad in (t.astype(float), t.reshape(2, 1)):
@@ -256,14 +252,12 @@ def test_taxels_are_counted_one_by_one(
     np.testing.assert_array_equal(listed.dense(), got)
     for a, b in zip(listed.offsets[:-1], listed.offsets[1:], strict=True):
         assert (np.diff(listed.cell[a:b].astype(int)) > 0).all()
-    totals = window_totals(events, starts, how, width, height)
-    np.testing.assert_array_equal(totals, expected.sum(axis=(1, 2)))
     # a sample of taxels has no sides to be mirrored along
     mirrored = listed.mirrored(np.arange(5) % 4)
     np.testing.assert_array_equal(mirrored.dense(), got)
 
 
-@pytest.mark.parametrize("counted", [bin_events, list_events, window_totals])
+@pytest.mark.parametrize("counted", [bin_events, list_events])
 @pytest.mark.parametrize("size", [(38, 1), (40, 1), (39, 2)])
 def test_a_sensor_has_as_many_taxels_as_its_windows(counted: Any, size: tuple[int, int]) -> None:
     one = np.array([0])

@@ -17,7 +17,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.baseline_nets import TAXEL_KINDS
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.analysis.windows.sample_sets import load_class_samples
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
 from sliplab.flows.planning.json_schemas import file_schema
@@ -57,7 +57,8 @@ def copied(judged: Store, tmp_path: Path) -> Store:
 
 def samples(store: Store, split: str) -> SampleSet:
     """The samples of a part of the split."""
-    return load_class_samples(StoreLabels(store), collected(store), split)
+    campaigns = collected(store)
+    return load_samples(StoreLabels(store), campaigns, split, classes=class_names(campaigns))
 
 
 def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: Store) -> None:
@@ -103,10 +104,9 @@ def test_accuracy_by_length_is_that_of_spikes_so_far(judged: Store) -> None:
     found = class_evaluation_of(judged)
     fitted = model_file.load(judged.folder / "models" / f"classes-seed{found.seed}.pt")
     test = samples(judged, "test")
-    stream = fitted.engine.stream()
     spikes = []
     for window in test.x:
-        stream.reset()
+        stream = fitted.engine.stream()
         spikes.append([stream.push(plane) for plane in window])
     so_far = np.cumsum(np.array(spikes, np.int64), axis=1)  # window, step, class
     step_ms = fitted.windows.step_ms

@@ -26,12 +26,13 @@ from sliplab.analysis.networks.network import (
     spike_counts,
     weights,
 )
-from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quantise, quantised_net
+from sliplab.analysis.networks.quantised import quantise
 from sliplab.analysis.networks.synaptic import count_net_work
 from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.flows.exports import ExportRequest, export
 from sliplab.plugins.deploy.card import SplitResult, card_markdown, model_card
+from sliplab.plugins.deploy.chip import LOWEST, chip_run, compare, quantised_net, rounding
 from sliplab.plugins.deploy.document import CardCampaign, CardData, ModelFile
 from sliplab.plugins.deploy.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.plugins.deploy.speck import CORES, KI, speck_fit
@@ -205,7 +206,7 @@ def test_weights_and_threshold_are_whole_and_in_range() -> None:
             assert whole.dtype == np.int8
             real = parameters(net)[key].detach().numpy().astype(np.float64)
             assert np.abs(whole / found.scales[name] - real).max() <= 0.5001 / found.scales[name]
-    assert all(0 < share < 0.05 for share in found.rounding(net).values())
+    assert all(0 < share < 0.05 for share in rounding(found, net).values())
 
 
 def test_the_chips_arithmetic_is_the_networks_in_whole_numbers() -> None:

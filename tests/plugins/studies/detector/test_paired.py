@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from sliplab.analysis.metrics.paired import PairedDifference, paired_difference
+from sliplab.plugins.studies.detector.paired import PairedDifference, paired_difference
 
 
 def test_the_interval_is_that_of_the_paired_test() -> None:

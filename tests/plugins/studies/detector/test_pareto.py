@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.metrics.pareto import front
+from sliplab.plugins.studies.detector.pareto import front
 
 COST = st.one_of(st.integers(0, 3).map(float), st.just(float("inf")), st.floats(-1, 1))
 

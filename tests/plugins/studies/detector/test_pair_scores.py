@@ -12,8 +12,9 @@ from sliplab.analysis.detectors.latency import (
     summarise_latency,
     summarise_lead,
 )
-from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, score, sweep
+from sliplab.analysis.detectors.rule_sweep import SpikeCounts, Trials, sweep
 from sliplab.analysis.detectors.smoothing_rule import detect
+from sliplab.plugins.studies.detector.pair_scores import score
 from sliplab.protocols.detection import Detection
 
 MS = 1_000_000
