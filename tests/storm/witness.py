@@ -85,7 +85,7 @@ class Witness:
         limits = file.limits
         self._calm = calm
         self.lie = Lie(lambda: host.passed_s)
-        self._lied = ""
+        self._lied: tuple[str, Any] = "", None
         self._lied_s: float | None = None
         self._segment: Segment | None = None
         self._misled = False
@@ -399,11 +399,11 @@ class Witness:
             if self._misled or shown is None or not self._excess(shown) > PLATE_MM + ENDS_MM:
                 self._lied_s = None
                 return
-        if self._lied_s is None or kind != self._lied:
-            self._lied, self._lied_s = kind, now_s
+        frozen = self.lie.frozen if kind == "pose_frozen" else None
+        if self._lied_s is None or (kind, frozen) != self._lied:  # another pose is news
+            self._lied, self._lied_s = (kind, frozen), now_s
         bound_s = self._poll_s + SLACK_S
         if kind == "pose_frozen":
-            frozen = self.lie.frozen
             if frozen is None or is_near(frozen, segment.to):
                 return
             bound_s += STUCK_S + STUCK_MM / segment.speed_mm_s + self._poll_s
