@@ -264,10 +264,12 @@ class Ledger:
         truth = (record.simulation_truth or {}).get("clocks", {})
         for device, clock in record.clocks.devices().items():
             pairs = np.array(truth.get(DEVICES.get(device, device), ()))
+            if clock.grade == "host arrival":
+                pairs = np.array(self._sent[name]["arrived"] if device == "frames" else ())
             if clock.first_ns is not None and len(pairs):  # beyond its pulses nothing is stated
                 between = (pairs[:, 0] >= clock.first_ns) & (pairs[:, 0] <= clock.last_ns)
                 pairs = pairs[between]
-            if not len(pairs) or clock.grade == "host arrival" or clock.uncertainty_ns is None:
+            if not len(pairs) or clock.uncertainty_ns is None:
                 continue
             error = np.abs(np.asarray(clock.map.to_reference(pairs[:, 0])) - pairs[:, 1]).max()
             if clock.kind == "95 %":

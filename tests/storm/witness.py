@@ -28,6 +28,7 @@ from sliplab.rigs.core.motion_watch import is_near
 from sliplab.rigs.core.reacting import Reflex
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.streams import FrameChunk
 from sliplab.storage.trials import control
 from sliplab.storage.trials.context import SKIN, LoggedContext
 from tests.patching import put
@@ -101,6 +102,7 @@ class Witness:
         self._outside: tuple[float, float] | None = None
         self._began_over = 0.0
         self._handed: Counter[str] | None = None
+        self._arrived: list[tuple[int, int]] = []
         self._zeroed = self._ever_zeroed = False
         self._corners: list[Any] = []
         self._blind: tuple[Any, float] | None = None
@@ -245,6 +247,7 @@ class Witness:
             self.resumed = False
             tee, began_s = Tee(sink), self._host.wall_s
             self._corners.clear()
+            self._arrived.clear()
             done = run_trial(rig, program, tee, *more, **named)
             about = {
                 "sent": tee.columns,
@@ -253,6 +256,7 @@ class Witness:
                 "times": [began_s, self._host.wall_s],
                 "zero_mm": rig.plate_frame.zero_mm,
                 "phases": [[step.phase, step.recorded] for step in program.steps],
+                "arrived": self._on_box(rig) if self._calm else [],
             }
             self._notes.add(recorded=getattr(sink, "_sink", sink).folder.name, **about)
             return done
@@ -276,6 +280,8 @@ class Witness:
                 chunk = read(device)
                 if self._handed is not None:
                     self._handed[chunk.KIND.name] += len(chunk)
+                    if isinstance(device, MockFrameCamera) and device.timed_by_host:
+                        self._arrived += _exposed(device, chunk)
                 return chunk
 
             return reading
@@ -283,6 +289,12 @@ class Witness:
         for kind, names in READS.items():
             for name in names:
                 setattr(kind, name, counting(getattr(kind, name)))
+
+    def _on_box(self, rig: Rig) -> list[tuple[int, int]]:
+        """Return when some frames arrived, and when they were exposed by the box's clock, ns."""
+        box = rig.sync
+        assert isinstance(box, MockSyncBox)
+        return [(arrived, int(box.clock.to_reference(true))) for arrived, true in self._arrived]
 
     def watch(self, supervisor: CollectionSupervisor, plan: Plan) -> None:
         """Watch what a collection is allowed between its trials."""
@@ -464,6 +476,16 @@ class Witness:
             self._outside = now_s, over
         elif now_s - self._outside[0] > self._poll_s + SLACK_S:
             self.wrong("within limits", f"moves on {over:.2f} mm outside")
+
+
+def _exposed(camera: MockFrameCamera, chunk: FrameChunk) -> list[tuple[int, int]]:
+    """Return when the first and the last frame of a chunk arrived, and when they were exposed."""
+    if not len(chunk):
+        return []
+    some = np.array([0, -1])
+    ticks = chunk.number[some] + camera._next_tick - camera._number
+    mid_ns = camera._trigger.true_ns(ticks) + camera.mid_exposure_ns
+    return [*zip(chunk.t_ns[some].tolist(), mid_ns.tolist(), strict=True)]
 
 
 def _world(rig: Rig) -> SimulatedWorld:
