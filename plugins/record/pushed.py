@@ -211,6 +211,8 @@ class PushedStream:
         times = times.astype(np.int64)
         if self._host_clock and len(times) and abs(int(times[-1]) * per_unit - now) > _DAY_NS:
             text = 'is not of time.monotonic_ns(); declare the stream with clock="own"'
+            if abs(int(times[-1]) - now) <= _DAY_NS:
+                text = "is in ns; times of events are in us: give time.monotonic_ns() // 1000"
             raise InputError(self._name, "t", int(times[-1]), text)
         expected = self.columns or (("x", "y", "p") if per_unit > 1 else ("images",))
         given = dict(zip(expected, values, strict=False)) | dict(named)
@@ -248,7 +250,8 @@ class PushedStream:
         ):
             text = "cannot be stored: float64 holds whole numbers up to 2**53; push it in two parts"
             raise InputError(self._name, name, int(found[np.argmax(np.abs(found))]), text)
-        if self._camera == EVENTS_KIND and not np.array_equal(found, np.floor(found)):
+        whole = np.isfinite(found) & (found == np.floor(found))
+        if self._camera == EVENTS_KIND and not whole.all():
             raise InputError(self._name, name, value, "must be whole numbers")
         return found
 

@@ -58,7 +58,7 @@ LOST = ("lost", "late", "overflowed", "dropped", "malformed")
 _FRAME_RATE = 100
 """Time base of videos only."""
 _UNITS = {each.symbol.lower().replace("/", "_"): each.symbol for each in TABLE}
-_LEVEL = re.compile(r"[^A-Za-z0-9_.+-]+")
+_LEVEL = re.compile(r"[A-Za-z0-9_.+-]+")
 
 
 class Recorder:
@@ -114,6 +114,7 @@ class Recorder:
         self.committed: list[str] = []
         self._experiment = ""
         self._running: RecordedTrial | None = None
+        self._open = False
 
     def __enter__(self) -> Self:
         with ExitStack() as undo, ExitStack() as devices:
@@ -140,9 +141,11 @@ class Recorder:
             if self._pulses is not None:  # columns of LSL are known now
                 check_pulses(self._pulses, self.sources)
             self._undo = undo.pop_all()
+        self._open = True
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._open = False
         with self._undo:
             if self._running is not None:
                 self._running.close("the recording ended")
@@ -155,12 +158,17 @@ class Recorder:
                 ``grip`` of 2.0 N.
 
         Raises:
-            InputError: a value is neither text nor a number.
-            RuntimeError: a trial is being recorded.
+            InputError: a value is neither a number nor text of a to z, digits, spaces and ``_.+-``.
+            RuntimeError: a trial is being recorded, or the recording has not begun, or has ended.
         """
+        self._check_free()
+        return RecordedTrial(self, levels(condition))
+
+    def _check_free(self) -> None:
+        if not self._open:
+            raise RuntimeError("a trial is recorded within the block: with record(...) as recorder")
         if self._running is not None:
             raise RuntimeError("a trial is being recorded; end it first")
-        return RecordedTrial(self, levels(condition))
 
     def _next_id(self) -> tuple[str, int]:
         known = {
@@ -189,7 +197,11 @@ def _level(name: str, value: object) -> tuple[str, str]:
     if isinstance(value, bool) or not isinstance(value, (str, int, float, np.number)):
         raise InputError("trial", name, value, "must be text or a number")
     if isinstance(value, str):
-        return name, _LEVEL.sub("_", value) or "_"
+        level = "_".join(value.split())
+        if not _LEVEL.fullmatch(level):  # characters left out would make one level of two
+            right = "must be of the letters a to z, digits, spaces and _ . + -"
+            raise InputError("trial", name, value, right)
+        return name, level
     try:
         finite = math.isfinite(float(value))
     except OverflowError:
@@ -228,6 +240,7 @@ class RecordedTrial:
         self.bytes_written = 0
 
     def __enter__(self) -> Self:
+        self._recorder._check_free()
         self._recorder._running = self
         self._thread.start()
         self._wait(self._began, START_S, "the devices did not start")

@@ -213,6 +213,14 @@ class _Newest:
         self._sink.add(device, chunk)
 
 
+def _is_size(px: object) -> bool:
+    return (
+        isinstance(px, (tuple, list))
+        and len(px) == 2
+        and all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in px)
+    )
+
+
 def push(
     name: str,
     columns: Mapping[str, str] | None = None,
@@ -242,6 +250,13 @@ def push(
     given = [each for each in (columns, events_px, frames_px) if each is not None]
     if len(given) != 1:
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
+    units = columns if isinstance(columns, Mapping) else None
+    if columns is not None and not (units and all(isinstance(u, str) for u in units.values())):
+        right = 'must name the unit of each column: {"width": "mm"}'
+        raise InputError(name, "columns", columns, right)
+    for key, px in (("events_px", events_px), ("frames_px", frames_px)):
+        if px is not None and not _is_size(px):
+            raise InputError(name, key, px, "must be columns and rows, whole numbers above 0")
     if clock not in {"host", "own", *SHARED}:
         raise InputError(name, "clock", clock, "must be host, own, ptp or utc")
     if uncertainty_ms is not None and not is_bound(uncertainty_ms):

@@ -43,7 +43,15 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, scratch_folder
 from sliplab.storage.process import Child, start_tethered
 from sliplab.storage.schema.label import LABELS, TrialLabel
-from sliplab.storage.streams import EVENTS_KIND, FRAMES_KIND, I64, SCALAR, WRENCH, EventChunk
+from sliplab.storage.streams import (
+    CLOCK,
+    EVENTS_KIND,
+    FRAMES_KIND,
+    I64,
+    SCALAR,
+    WRENCH,
+    EventChunk,
+)
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
@@ -97,7 +105,8 @@ def save(subject: Subject, path: Path) -> dict[str, int]:
             further = {
                 name: about.kind
                 for name, about in record.streams.items()
-                if about.timing is not None or record.imported is not None
+                if (about.timing is not None or record.imported is not None)
+                and about.kind != CLOCK.name
             }
             shown = blueprint(library, forces=forces, further=further)
             stream.save(unfinished, default_blueprint=shown)
@@ -299,6 +308,8 @@ def _event_camera(to: _Columns, recording: Recording, stream: str, path: str) ->
 def _further(to: _Columns, recording: Recording) -> None:
     """Send the streams of further devices, each below its name."""
     for name, about in sorted(recording.record.streams.items()):
+        if about.kind == CLOCK.name or not about.rows:  # readings of a clock have no clock
+            continue
         path, count = f"streams/{name}", f"{name}_{about.kind}"
         if about.kind == EVENTS_KIND:
             to.sent[count] = _event_camera(to, recording, name, path)

@@ -156,6 +156,42 @@ def test_wrong_rows_are_refused(tmp_path: Path, pushed: tuple[object, ...], key:
             trial.push("nothing", None, 1.0)
     with pytest.raises(RuntimeError, match="no trial"):
         trial.push("pull", None, 1.0, 2.0)
+    with pytest.raises(RuntimeError, match="within the block"):
+        recording.trial()
+
+
+def test_times_of_events_in_nanoseconds_are_named(tmp_path: Path) -> None:
+    with (
+        record([push("events", events_px=(8, 4))], tmp_path, "wrong") as recording,
+        recording.trial() as trial,
+        pytest.raises(InputError, match="times of events are in us"),
+    ):
+        trial.push("events", time.monotonic_ns(), 1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("declared", "key"),
+    [
+        ({"columns": {"v": 5}}, "columns"),
+        ({"columns": ["v"]}, "columns"),
+        ({"columns": {}}, "columns"),
+        ({"events_px": 5}, "events_px"),
+        ({"events_px": (0, 1)}, "events_px"),
+        ({"frames_px": (64, 4.5)}, "frames_px"),
+    ],
+    ids=str,
+)
+def test_wrong_declarations_are_refused(declared: Any, key: str) -> None:
+    with pytest.raises(InputError) as raised:
+        push("x", **declared)
+    assert raised.value.key == key
+
+
+def test_one_trial_is_recorded_at_a_time(tmp_path: Path) -> None:
+    with record([push("pull", {"fx": "N"})], tmp_path, "two") as recording:
+        first, second = recording.trial(), recording.trial()
+        with first, pytest.raises(RuntimeError, match="end it first"), second:
+            pass
 
 
 def test_one_program_at_a_time_and_one_kind_of_campaign(tmp_path: Path) -> None:
@@ -194,7 +230,10 @@ def test_a_condition_has_its_unit_in_its_name(
 
 @pytest.mark.parametrize(
     "condition",
-    [{"": 1}, {"a b": 1}, {"x/y": 1}, {"grip_n": 2, "grip": 3}, {"x": 10**400}, {"x": None}],
+    [
+        *({"": 1}, {"a b": 1}, {"x/y": 1}, {"grip_n": 2, "grip": 3}, {"x": 10**400}, {"x": None}),
+        *({"x": "\u00e4"}, {"x": ""}, {"x": "a/b"}),
+    ],
     ids=str,
 )
 def test_conditions_that_say_nothing_or_two_things_are_refused(condition: Any) -> None:
@@ -225,7 +264,7 @@ def test_values_that_are_no_numbers_or_would_be_rounded_are_refused(value: objec
         source.device.push(None, value, 1.0)
 
 
-@pytest.mark.parametrize("pixel", [1.5, float("nan"), "1", None])
+@pytest.mark.parametrize("pixel", [1.5, float("nan"), float("inf"), "1", None])
 def test_pixels_of_events_are_whole_numbers(pixel: object) -> None:
     source = push("events", events_px=(8, 4))
     with pytest.raises(InputError, match="events: x"):
@@ -261,3 +300,23 @@ def test_a_stream_is_recorded_once_and_has_a_name_of_its_own(tmp_path: Path) -> 
         record([pull, push("pull_clock", {"a": ""})], tmp_path / "b", "two").__enter__()
     with record([pull], tmp_path / "b", "two"):
         pass
+
+
+def test_a_stream_of_which_nothing_came_is_there_after_export_and_import(tmp_path: Path) -> None:
+    streams = [
+        push("pull", {"fx": "N"}),
+        push("grip", {"v": "mm"}),
+        push("imu", {"x": "", "y": ""}),
+    ]
+    with record(streams, tmp_path / "a", "c") as recording, recording.trial() as trial:
+        trial.push("pull", None, 1.5)
+    sliplab.export(tmp_path / "a", "mcap", tmp_path / "m", licence="CC0-1.0", creator=["Ada"])
+    sliplab.import_data(tmp_path / "m", tmp_path / "b", name="again")
+    found = sliplab.open_store(tmp_path / "b")
+    assert found.verify()["ok"]
+    streams_of = found.trial(trial.id).recording.record.streams
+    assert {name: each.rows for name, each in streams_of.items()} == {
+        "pull": 1,
+        "grip": 0,
+        "imu": 0,
+    }

@@ -16,12 +16,15 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.plugins.record.recorder import record
+from sliplab.plugins.record.sources import push
 from sliplab.plugins.view import view
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import ReviewedOnsets
+from sliplab.storage.trials.store import Store
 from tests.analysis.labels import reviewable
 from tests.analysis.labels.reviewable import EVENTS, FRAMES, NAME, Reviewable, events, frame_times
 from tests.flows.listening import listening
@@ -237,3 +240,15 @@ def test_what_is_missing_is_said(
     with pytest.raises(ModuleNotFoundError, match="rerun"):
         view.save(subject, tmp_path / "c.rrd")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_without_a_protocol_is_shown(tmp_path: Path) -> None:
+    """The readings of a stream's clock are no stream to be shown: nothing times them."""
+    sources = [push("events", events_px=(8, 4)), push("pull", {"fx": "N"})]
+    with record(sources, tmp_path / "s", "grasps") as recording, recording.trial() as trial:
+        for n in range(5):
+            trial.push("events", None, n, 1, 1)
+            trial.push("pull", None, float(n))
+    path = tmp_path / "v.rrd"
+    view.save(view.find(Store.open(tmp_path / "s"), trial.id), path)
+    assert Read(path).curve("/streams/pull")[1] == [0.0, 1.0, 2.0, 3.0, 4.0]
