@@ -10,6 +10,7 @@ events of each cell, gradient boosting on the counts of cells and steps, and ord
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import log_softmax
-from threadpoolctl import threadpool_limits
 
 from sliplab.analysis.metrics.classification import CLASSES, Labels, check_labels
 from sliplab.analysis.windows.dataset import SampleSet
@@ -238,9 +238,17 @@ def fit_logistic(
         return float(loss), gradient.ravel()
 
     # sums over threads differ between numbers of them, and waiting costs the most
-    with threadpool_limits(1):
+    with _one_thread():
         found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
     return Logistic(np.asarray(found.x).reshape(shape), mean, scale, int(found.nit))
+
+
+def _one_thread() -> AbstractContextManager[Any]:
+    """Let libraries use one thread."""
+    from threadpoolctl import threadpool_limits  # of an extra, which reading a store does not need
+
+    limited: AbstractContextManager[Any] = threadpool_limits(1)
+    return limited
 
 
 def _of_total(totals: FloatArray) -> FloatArray:
@@ -278,7 +286,7 @@ def boosted(
         probabilities (n, classes), and what was fitted as text and numbers.
     """
     model = fitted_trees(train, validation, rounds, classes)
-    with threadpool_limits(1):
+    with _one_thread():
         votes = model.predict_proba(features(test)) if len(test) else np.empty((0, classes))
     return votes, {"rounds": int(model.n_iter_), "most_rounds": rounds, "patience": PATIENCE}
 
@@ -308,7 +316,7 @@ def fitted_trees(
         random_state=_SEED,
     )
     # in one thread: its threads wait for each other busily, 30 times slower under other load
-    with threadpool_limits(1):
+    with _one_thread():
         model.fit(
             features(train.windows),
             train.y,
