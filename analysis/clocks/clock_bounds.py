@@ -23,9 +23,9 @@ Floats = NDArray[np.float64]
 MIN_PAIRS = 3
 MOST_YEARS = 100
 PIECE = 64
-"""Messages of which each run between two jumps of a clock holds a whole piece."""
+"""Messages in a piece; between two jumps of a clock there is at least one whole piece."""
 MOST_ROWS = 4000
-"""Messages whose bounds say as much about a straight line as those of all."""
+"""Messages that bound a straight line as well as all of them do."""
 
 
 class BoundsContradictError(ValueError):

@@ -213,11 +213,19 @@ class _Newest:
         self._sink.add(device, chunk)
 
 
+def _are_units(columns: object) -> bool:
+    return (
+        isinstance(columns, Mapping)
+        and bool(columns)
+        and all(isinstance(unit, str) for unit in columns.values())
+    )
+
+
 def _is_size(px: object) -> bool:
     return (
         isinstance(px, (tuple, list))
         and len(px) == 2
-        and all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in px)
+        and all(isinstance(n, (int, np.integer)) and type(n) is not bool and n > 0 for n in px)
     )
 
 
@@ -250,8 +258,7 @@ def push(
     given = [each for each in (columns, events_px, frames_px) if each is not None]
     if len(given) != 1:
         raise InputError(name, "columns", None, "give columns, events_px or frames_px, one of them")
-    units = columns if isinstance(columns, Mapping) else None
-    if columns is not None and not (units and all(isinstance(u, str) for u in units.values())):
+    if columns is not None and not _are_units(columns):
         right = 'must name the unit of each column: {"width": "mm"}'
         raise InputError(name, "columns", columns, right)
     for key, px in (("events_px", events_px), ("frames_px", frames_px)):
@@ -269,7 +276,8 @@ def push(
         raise InputError(name, "delay_ms", delay_ms, right)
     kind = None if columns is not None else EVENTS_KIND if events_px else FRAMES_KIND
     _check_name(name, kind)
-    size = events_px or frames_px
+    px = events_px or frames_px
+    size = None if px is None else (int(px[0]), int(px[1]))
     device = PushedStream(name, columns, kind, size, clock == "host")
     told: dict[str, Any] = {"kind": kind or (device.kind.name if device.kind else ""), "rows": 0}
     if size is not None:

@@ -422,7 +422,7 @@ _IN_FAKES: Mapping[str, Mapping[str, str]] = {
     "answer_late": {"arm": INJECT, "sync_box": "answer_late"},
     # the next `rigs.core.fakes.PACKETS_LOST` packets of poses are not sent
     "poses_lost": {"arm": INJECT},
-    # somebody presses the emergency stop
+    # a person presses the emergency stop
     "arm_emergency_stop": {"arm": INJECT},
     # a light curtain or a door stops the arm; a running program is paused
     "arm_safeguard_stop": {"arm": INJECT},

@@ -3,9 +3,9 @@
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
 index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
 other streams are in the same file. Columns are chunked and compressed with bitshuffle, events in
-LZ4 and the others in zstd; of a recording without a protocol in gzip, which every HDF5 reads, for
-its other readers are not known. Attributes give every column its unit. Files carry no time stamps:
-the same data are the same bytes.
+LZ4 and the others in zstd; of a recording without a protocol in gzip, which every HDF5
+library reads. Attributes give every column its unit. Files carry no time stamps: the same data are
+the same bytes.
 
 A trial has more columns than most of them have chunks, so that making, opening and resizing them
 costs more than their data. So every file begins as a copy of one that has all columns and no rows,
@@ -145,7 +145,7 @@ def create(file: Any, name: str, column: Column, guarded: bool = False) -> None:
     """Make a dataset without rows in an open `h5py.File`.
 
     Args:
-        guarded: for a recording beside other programs: with filters that every HDF5 has.
+        guarded: for a recording without a protocol: use filters that every HDF5 library has.
     """
     data = file.create_dataset(
         name,

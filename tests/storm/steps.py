@@ -378,7 +378,7 @@ def damage(process: Process, step: dict[str, Any]) -> None:
         process.notes.add(spoilt=path.name)
     path.chmod(0o644)
     if where == "incoming" and not _has_sums(path.parent):
-        how = "cut"  # before a trial has checksums, nobody can see a changed byte
+        how = "cut"  # before a trial has checksums, a changed byte cannot be seen
     if how == "cut":
         os.truncate(path, 1000)
         return

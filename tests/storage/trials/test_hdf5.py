@@ -245,7 +245,7 @@ assert "hdf5plugin" not in sys.modules
 
 
 def test_a_recording_without_a_protocol_is_read_by_h5py_alone(tmp_path: Path) -> None:
-    """Whoever records beside a program of their own has none of our packages."""
+    """Programs of other labs do not have the filters of `hdf5plugin`."""
     path, late_us = tmp_path / "data.h5", 2**33
     t_ns = np.arange(70_000, dtype=np.int64)
     values = ScalarChunk(t_ns, t_ns, np.sin(t_ns / 100.0), "mm")
