@@ -60,6 +60,8 @@ _ENDLESS = {
     "alerts": "interrupted: no longer watching; what waits is sent when alerts run again",
     "page": "interrupted: the page is closed; a collection that runs goes on",
     "detect": "interrupted: no longer detecting",
+    "record": "interrupted: every committed trial is kept; of an unfinished one, the next "
+    "recording or `sliplab verify` keeps what was written",
 }
 """What is said at the end of commands that run until they are interrupted."""
 _EXPECTED = {

@@ -185,6 +185,7 @@ def test_collect_takes_so_many_trials_and_no_more(tmp_path: Path) -> None:
         ("alerts", "no longer watching; what waits is sent"),
         ("page", "the page is closed"),
         ("detect", "no longer detecting"),
+        ("record", "every committed trial is kept; of an unfinished one"),
     ],
 )
 def test_an_endless_command_ends_in_plain_words(
