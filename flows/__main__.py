@@ -6,6 +6,7 @@ memory or open files are reported in one line as well.
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import signal
@@ -72,7 +73,10 @@ def _end(code: int) -> None:
 
 
 def _end_on_signals() -> None:
-    """End the program at once on a signal before it has begun or after its last message."""
+    """End the program at once on a signal before it has begun or after its last message.
+
+    A signal while the interpreter is taken down, when all is done, changes no exit code.
+    """
 
     def end(*_: object) -> None:
         stopping = sys.modules.get("sliplab.flows.running.stopping")
@@ -83,6 +87,8 @@ def _end_on_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
             signal.signal(number, end)
+            # registered first, called last; of an ignored signal the interpreter restores nothing
+            atexit.register(signal.signal, number, signal.SIG_IGN)
 
 
 def _run() -> int:

@@ -173,7 +173,8 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
             f"is in the campaigns {', '.join(each.name for each in holders)} of {folder}; "
             "choose one by --campaign"
             if holders
-            else f"is no campaign or committed trial of {folder}; campaigns: {', '.join(campaigns)}"
+            else f"is no campaign or committed trial of {folder}; campaigns: "
+            f"{', '.join(campaigns)}; `sliplab trials {folder}` lists the trials"
         )
         raise InputError("PART", "", part, text)
     return opened, holders[0], [part]

@@ -84,7 +84,7 @@ def read_rig(path: Path) -> RigSource:
         there = _parent_file(here, parent)
         if not os.path.exists(there):  # pathlib raises for a name that is too long
             known = shipped_rigs()
-            near = did_you_mean(there.name, [*known, *neighbours(there)])
+            near = did_you_mean(there.stem, known) or did_you_mean(there.name, neighbours(there))
             text = f"no such file, nor a shipped rig ({', '.join(known)}){near}"
             raise InputError(here, KEY, parent, text)
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:

@@ -52,7 +52,7 @@ def trials(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List committed trials, and quarantined or skipped ones with their causes."""
+    """List committed trials, and those that are not taken again, with their causes."""
     from sliplab.flows.planning.campaign_trials import all_excluded, print_excluded
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import catalogue, query
@@ -120,7 +120,8 @@ def verify(
         console.say(f"{path}: another program had left it open for writing; as committed again")
     if moved := found.get("quarantined"):
         console.say(
-            f"{plural(len(moved), 'damaged trial')} quarantined; `sliplab collect` retakes them"
+            f"{plural(len(moved), 'damaged trial')} quarantined; `sliplab collect` retakes what a "
+            "protocol asks for"
         )
     for trial in found.get("salvaged", ()):
         console.say(f"{trial}: was salvaged from a damaged file: intact, but not all of it")

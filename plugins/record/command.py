@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.flows.cli.common import COLLECT, JsonOption, StoreOption, finish
-from sliplab.flows.running import console, stopping
+from sliplab.flows.running import console, exit_codes, stopping
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ def record(
     """Record streams without a protocol and without an arm, trial by trial.
 
     At a terminal keys start, stop and mark; otherwise it begins at once. Ctrl-C ends and keeps the
-    trial. After a crash, what verifies of an unfinished trial is kept by the next record or verify.
+    trial, and so does the end of the last stream. Ends with 1 if a stream failed or nothing came.
+    After a crash, what verifies of an unfinished trial is kept by the next record or verify.
     """
     from sliplab.plugins.record.keys import pressed_keys
     from sliplab.plugins.record.recorder import Recorder, levels
@@ -104,11 +105,11 @@ def record(
         for trial in recorder.salvaged:
             console.say(f"kept what verifies of the unfinished trial {trial}")
         session = _Session(recorder, given, key, length_s, every_s)
+        early: KeyboardInterrupt | None = None
         try:
             session.run()
-        except KeyboardInterrupt:
-            if length is not None:
-                raise
+        except KeyboardInterrupt as error:
+            early = error if length is not None else None
         finally:
             session.end()
         result = {
@@ -119,6 +120,10 @@ def record(
             "faults": session.faults,
         }
     finish(result, f"recorded into {store}", as_json)
+    if early is not None:
+        raise early
+    if session.faults:
+        raise typer.Exit(exit_codes.FAILED)
 
 
 @dataclass
@@ -128,7 +133,7 @@ class _Session:
     Attributes:
         key: returns the next key; None without a terminal.
         length_s, every_s: of the whole, and of each trial; None without a limit.
-        lost: rows that are known to be lost, by stream. faults: of streams.
+        lost: rows that are known to be lost, by stream. faults: of streams, and empty trials.
     """
 
     recorder: Recorder
@@ -152,6 +157,8 @@ class _Session:
             console.say(KEYS)
         while self._answer(self.key() if self.key is not None else ""):
             if self.trial is not None:
+                if len(self.trial.faults) == len(self.recorder.sources):
+                    return  # no stream is left
                 seconds = (time.monotonic_ns() - self.trial.begin_ns) / 1e9
                 if self.length_s is not None and self._recorded_s + seconds >= self.length_s:
                     return
@@ -172,6 +179,8 @@ class _Session:
             trial.close()
         finally:
             self.faults += trial.faults.values()
+            if trial.record is not None and not any(trial.rows().values()):
+                self.faults.append(f"trial {trial.id}: nothing came from any stream")
             for name, count in trial.lost().items():
                 self.lost[name] = self.lost.get(name, 0) + count
             self._line("")

@@ -42,7 +42,7 @@ def why_unreachable(settings: UvcSettings) -> str | None:
     try:
         kind = os.stat(device).st_mode
     except OSError as error:
-        return f"{device}: {error.strerror}; plug the camera in, or change devices.frame_camera"
+        return f"{device}: {error.strerror}; plug the camera in, or name another device"
     if not stat.S_ISCHR(kind):
         return f"{device} is not a device"
     if not os.access(device, os.R_OK | os.W_OK):

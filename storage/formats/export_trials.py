@@ -53,7 +53,7 @@ def export_trials(
         except StoreError:  # a damaged trial, some of which are ValueErrors, too
             raise
         except ValueError as error:
-            raise InputError("--format", "", kind, f"trial {recording.trial_id} {error}") from None
+            raise InputError("--as", "", kind, f"trial {recording.trial_id} {error}") from None
         listed.append(_listed(recording, path.name, counts))
     sync_folder(folder)
     simulated = any(recording.simulated for recording in recordings)

@@ -168,7 +168,7 @@ class Recording:
         store = self.folder.parents[3] if len(self.folder.parents) > 3 else self.folder
         return StoreError(
             f"{what}: this trial is damaged; `sliplab verify {store} --quarantine` quarantines "
-            "it, and `sliplab collect` retakes it"
+            "it, and `sliplab collect` retakes what a protocol asks for"
         )
 
     @property

@@ -422,7 +422,8 @@ class Store:
         refuse_url(folder)
         path = folder / STORE
         if not path.is_file():
-            raise NoStore(folder, "is not a store (no store.json); `sliplab collect` creates one")
+            text = "is not a store (no store.json); `sliplab collect`, `record`, `import` make one"
+            raise NoStore(folder, text)
         try:
             found = read_json(path).get("format")
         except (OSError, ValueError) as error:

@@ -126,6 +126,7 @@ def test_a_fault_is_blamed_on_the_file_that_has_it(
     ("text", "says"),
     [
         ("extends: none.yaml\n", "extends = none.yaml: no such file"),
+        ("extends: mock_weak.yaml\n", "did you mean 'mock_weak'?"),
         ("extends: child.yaml\n", "extends = child.yaml: is circular"),
         ("extends: [mock.yaml]\n", "must be the path of a rig file"),
         ('extends: "a\\0b"\n', "must be the path of a rig file"),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -196,3 +198,21 @@ def test_an_endless_command_ends_in_plain_words(
     assert ended.exit_code == 130
     assert ended.message.startswith(f"interrupted: {says}")
     assert "half-written" not in ended.message
+
+
+LATE = """
+import os, signal, sys
+class Late:
+    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.{name}):
+        kill(pid, number)  # when modules are cleared, after the program's own handlers are gone
+sys.late = Late()
+from sliplab.flows.__main__ import main
+sys.argv = ["sliplab", "--version"]
+main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_while_the_interpreter_ends_changes_no_exit_code(name: str) -> None:
+    done = subprocess.run([sys.executable, "-c", LATE.format(name=name)], capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")

@@ -40,12 +40,7 @@ def streams(tmp_path: Path) -> Iterator[Path]:
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     file = tmp_path / "streams.yaml"
-    place = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-    file.write_text(
-        "streams:\n"
-        "  gauge: {kind: table, device: "
-        f"{{driver: columns, place: '{place}', columns: {{pull: N, angle: deg}}}}}}\n"
-    )
+    file.write_text(_gauge(server))
     yield file
     end.set()
     thread.join(5)
@@ -122,6 +117,62 @@ def test_keys_start_mark_and_stop_and_ctrl_c_keeps_the_trial(tmp_path: Path, str
     assert [mark.name for mark in first.record.imported.marks] == ["slip"]
     assert first.record.imported.given.uncertainty_ns == 5e8
     assert second.record.streams["gauge"].rows > 0
+
+
+@pytest.mark.programs
+def test_ctrl_c_before_the_time_is_over_still_says_what_was_recorded(
+    tmp_path: Path, streams: Path
+) -> None:
+    store = tmp_path / "store"
+    words = ["record", str(streams), "--store", str(store), "--campaign", "rows", "--for", "60s"]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "sliplab", *words, "--json"], stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    while not list(store.glob("campaigns/rows/incoming/*/begun.json")):
+        assert time.monotonic() < deadline
+        assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    said, _ = child.communicate(timeout=60)
+    assert child.returncode == 130
+    assert json.loads(said)["trials"] == ["000001"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [(b"1,2\n", "gauge"), (b"", "nothing came from any stream")],
+)
+def test_a_recording_ends_with_its_last_stream_and_says_that_it_failed(
+    tmp_path: Path, sent: bytes, said: str
+) -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def send_and_leave() -> None:
+        with server.accept()[0] as link:
+            link.sendall(sent)
+
+    thread = threading.Thread(target=send_and_leave, daemon=True)
+    thread.start()
+    file = tmp_path / "short.yaml"
+    file.write_text(_gauge(server))
+    words = ["--store", tmp_path / "store", "--campaign", "rows", "--for", "600s", "--json"]
+    done = here("record", str(file), *words)
+    thread.join(5)
+    server.close()
+    assert done.returncode == 1
+    result = json.loads(done.stdout)
+    assert result["trials"] == ["000001"]
+    assert any(said in fault for fault in result["faults"]), result
+
+
+def _gauge(server: socket.socket) -> str:
+    """A file of streams with the rows of a server."""
+    place = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+    return (
+        "streams:\n"
+        "  gauge: {kind: table, device: "
+        f"{{driver: columns, place: '{place}', columns: {{pull: N, angle: deg}}}}}}\n"
+    )
 
 
 def _wait_for(screen: int, text: str) -> None:
