@@ -12,15 +12,26 @@ MARGIN = 2.0
 """Spikes by which a class must lead for each of its output neurons: the paper's rule."""
 SPIKE_THRESHOLD = 1.0
 """Membrane potential at which a neuron fires."""
+MOST_CHANNELS = 4096
+"""And hidden neurons, of a layer."""
+SIZES = frozenset(
+    {"conv1_channels", "conv2_channels", "hidden", "conv1_kernel", "conv2_kernel", "weight_scale"}
+)
+"""Settings that follow from the data with ``start: regression``."""
 Scale = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class NetworkSettings(StrictModel):
     """The spiking network: two convolutions, two fully connected layers, IAF neurons."""
 
-    conv1_channels: int = Field(default=8, ge=1, le=256)
-    conv2_channels: int = Field(default=16, ge=1, le=256)
-    hidden: int = Field(default=32, ge=1, le=1024)
+    start: Literal["random", "regression"] = Field(
+        default="random", exclude_if=lambda value: value == "random"
+    )
+    """First weights: drawn, or a logistic regression on the events of taxels, which sets the sizes
+    of all layers. It is the default where there are taxels, and no size is given."""
+    conv1_channels: int = Field(default=8, ge=1, le=MOST_CHANNELS)
+    conv2_channels: int = Field(default=16, ge=1, le=MOST_CHANNELS)
+    hidden: int = Field(default=32, ge=1, le=MOST_CHANNELS)
     outputs_per_class: int = Field(default=4, ge=1, le=64)
     """Output neurons of each class, whose spikes are counted together: with one, as in the paper,
     a window of 30 steps has 31 counts to distinguish classes by, and more ties."""

@@ -14,12 +14,15 @@ from pydantic import model_validator
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.key_errors import KeyedError
 from sliplab.protocols.labelling import Labelling
-from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.network_settings import MOST_CHANNELS, SIZES, NetworkSettings
 from sliplab.protocols.presets import COMPARED, PAPER, Value, at, expanded
 from sliplab.protocols.split import Split
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.protocols.yaml_file import StrictModel, rule
+
+BEGUN_SLOWER = 8.0
+"""Factor between the usual learning rates of the two starts of a network."""
 
 
 class AnalysisSettings(StrictModel):
@@ -42,15 +45,20 @@ class AnalysisSettings(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _preset(cls, data: Any) -> Any:
-        return expanded(data) if isinstance(data, dict) else data
+        return _begun_by_data(expanded(data)) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _spikes(self) -> AnalysisSettings:
-        """Margins in spikes scale with the number of output neurons per class."""
+        """Margins in spikes scale with the number of output neurons per class.
+
+        A network that begins as a regression learns slower, so that it does not forget it.
+        """
         factor = self.network.outputs_per_class / NetworkSettings().outputs_per_class
         usual, rule = Training(), Detection()
+        begun = self.network.start != "random"
+        rate = {"learning_rate": usual.learning_rate / BEGUN_SLOWER} if begun else {}
         changes: tuple[tuple[str, StrictModel, dict[str, Any]], ...] = (
-            ("training", self.training, {"gain": usual.gain / factor}),
+            ("training", self.training, {"gain": usual.gain / factor, **rate}),
             (
                 "detection",
                 self.detection,
@@ -65,6 +73,27 @@ class AnalysisSettings(StrictModel):
             found = part.model_copy(update=left)
             found.model_fields_set.difference_update(left)  # the user did not set them: `rule_for`
             object.__setattr__(self, name, found)  # frozen for all others
+        return self
+
+    @rule
+    def _start(self) -> AnalysisSettings:
+        network = self.network
+        if network.start == "random":
+            return self
+        key = "analysis.network"
+        if self.windows.taxels is None:
+            raise KeyedError(f"{key}.start", network.start, "needs windows.taxels")
+        if not network.biases:
+            raise KeyedError(f"{key}.biases", False, "must be true with start: regression")
+        if self.windows.channels > MOST_CHANNELS:
+            raise KeyedError(
+                f"{key}.start", network.start, f"is for {MOST_CHANNELS} channels at most"
+            )
+        for size in sorted(SIZES):
+            value = getattr(network, size)
+            if value != NetworkSettings.model_fields[size].default:
+                right = "must be left out with start: regression, which sets it"
+                raise KeyedError(f"{key}.{size}", value, right)
         return self
 
     @rule
@@ -145,3 +174,14 @@ class AnalysisSettings(StrictModel):
         third = length // 3
         whole = length % 3 == 0 and third % step == 0
         return self.detection.compare.stride_ms or (third if whole else length)
+
+
+def _begun_by_data(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the section with the start of a network of taxels, where it says nothing of that."""
+    windows, network = data.get("windows"), data.get("network", {})
+    taxels = windows.get("taxels") if isinstance(windows, dict) else None
+    if not isinstance(taxels, int) or 2 * taxels > MOST_CHANNELS or not isinstance(network, dict):
+        return data
+    if network.keys() & (SIZES | {"start", "biases"}):
+        return data
+    return {**data, "network": {"start": "regression", **network}}

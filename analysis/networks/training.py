@@ -29,6 +29,7 @@ from threadpoolctl import threadpool_limits
 from torch import nn
 
 from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import regression_start
 from sliplab.analysis.networks.gradients import work_on
 from sliplab.analysis.networks.network import (
     SPIKING,
@@ -349,9 +350,15 @@ def fit(
             classes or two of one name, a state of another training.
     """
     classes = check_classes(classes)
+    by_data = network.start == "regression"
+    network = regression_start.sized(network, windows, len(classes))
     run = TrainingRun(network, windows, training, seed, len(classes))
     train, train_y = _check(run.trained, windows, train_x, train_y, "training")
     val, val_y = _check(run.trained, windows, val_x, val_y, "validation")
+    if by_data:
+        regression_start.begin(run.fine, train, train_y)
+        run.to_grid()
+        run.settle()
     if state is not None:
         run.go_on(state)
         if on_epoch is not None:

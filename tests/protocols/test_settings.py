@@ -53,6 +53,39 @@ def test_taxels_are_channels_of_one_cell() -> None:
     assert found != Windows(length_ms=250, polarity="both")
 
 
+def test_a_network_that_begins_as_a_regression_learns_slower() -> None:
+    data: dict[str, Any] = {"windows": {"taxels": 39}}
+    found = AnalysisSettings.model_validate(data)
+    assert found.network.start == "regression"
+    usual = AnalysisSettings().training.learning_rate
+    assert found.training.learning_rate == usual / 8
+    assert AnalysisSettings.model_validate(found.model_dump(mode="json")) == found
+    sized = AnalysisSettings.model_validate({**data, "network": {"hidden": 32}})
+    assert sized.network.start == "random"
+    given = AnalysisSettings.model_validate({**data, "training": {"learning_rate": 0.1}})
+    assert given.training.learning_rate == 0.1
+
+
+@pytest.mark.parametrize(
+    ("network", "windows", "key", "right"),
+    [
+        ({}, {}, "start", "needs windows.taxels"),
+        ({"biases": False}, {"taxels": 4}, "biases", "must be true"),
+        ({"hidden": 8}, {"taxels": 4}, "hidden", "must be left out"),
+        ({"conv1_kernel": 1}, {"taxels": 4}, "conv1_kernel", "must be left out"),
+        ({}, {"taxels": 5000}, "start", "4096 channels at most"),
+    ],
+)
+def test_what_does_not_go_with_a_start_by_regression(
+    network: dict[str, Any], windows: dict[str, Any], key: str, right: str
+) -> None:
+    data = {"network": {"start": "regression", **network}, "windows": windows}
+    with pytest.raises(ValueError, match=right) as caught:
+        AnalysisSettings.model_validate(data)
+    (error,) = caught.value.errors()
+    assert error["ctx"]["error"].key == f"analysis.network.{key}"
+
+
 @pytest.mark.parametrize(
     ("data", "key", "right"),
     [
