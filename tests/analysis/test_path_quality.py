@@ -9,6 +9,7 @@ import pytest
 
 from sliplab.analysis.quality import path_deviation_mm, speed_deviation_percent
 from sliplab.storage.streams import F64, I64, PathSegment
+from tests.patching import loose
 
 LIMIT_PERCENT = 10.0
 """The gate's default."""
@@ -60,7 +61,7 @@ def poses(
 
 def deviation(gone: Path, speed: float, **how: float) -> float:
     """Of poses on the controller's clock that arrive 1 ms later."""
-    ns, place, segment, _ = poses(gone, **how)  # type: ignore[arg-type]
+    ns, place, segment, _ = loose(poses)(gone, **how)
     segment = PathSegment(segment.start_ns, segment.end_ns, segment.begin_mm, segment.end_mm, speed)
     return speed_deviation_percent(ns, ns + 1_000_000, place, [segment])
 

@@ -20,6 +20,7 @@ from sliplab.storage.schema.evaluation import DetectorRate
 from sliplab.storage.schema.label import OnsetDoubts, TrialLabel
 from sliplab.storage.trials.recording import Recording
 from tests.analysis.labels.reviewable import Reviewable
+from tests.patching import loose
 
 MS = 1_000_000
 START = 1_800_000_000_000_000_000
@@ -108,7 +109,7 @@ def test_equal_onsets_give_equal_rows() -> None:
 def test_a_row_is_what_the_trials_judge_gives() -> None:
     decisions = [decided(at, LATE_LABEL) for at in (850, 950, 1010, 1200)]
     for name, figures in judge_by_reference(decisions).items():
-        slip = LATE_LABEL[name].slip  # type: ignore[index]
+        slip = loose(LATE_LABEL[name]).slip
         scored = [score_trial(each.found, slip, TOLERANCE) for each in decisions]
         assert figures.latency_ms == summarise_latency(scored)
 

@@ -12,6 +12,7 @@ from sliplab.analysis.labels.labelling import label_results
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.storage.schema.label import TrialLabel
 from tests.analysis.foreign import chunk, foreign_campaign
+from tests.patching import loose
 
 SLIP = "adapter: 1\nname: slips\nexperiment: kinematic\n"
 MS = 1_000_000
@@ -68,4 +69,4 @@ def test_a_collected_trial_has_no_given_label() -> None:
             imported = None
 
     with pytest.raises(ValueError, match=r"labelling.rule = given: .*use the rule paper"):
-        given_label(Collected())  # type: ignore[arg-type]
+        loose(given_label)(Collected())

@@ -28,6 +28,7 @@ from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import FrameChunk
 from tests.command_line import answer, here, sliplab
 from tests.conftest import ROOT
+from tests.patching import put
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 QUICK = Creep(clearance_mm=2.5, search_mm=2.0)
@@ -176,7 +177,7 @@ def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> 
 
 def test_poses_that_are_all_alike_write_nothing(tmp_path: Path) -> None:
     here = session(lab(tmp_path))
-    here.rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
+    put(here.rig.operator, "ask", lambda task, prompt, expected: True)
     with pytest.raises(RigError, match="too much alike"):
         teach.teach_tool(here, 5, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
@@ -219,7 +220,7 @@ def test_camera_that_repeats_its_image_gives_no_pictures_of_a_board(tmp_path: Pa
         images = np.repeat(first[0][None], len(chunk), 0) if first else chunk.images
         return replace(chunk, images=images)
 
-    here.rig.frames.read = frozen  # type: ignore[method-assign]
+    put(here.rig.frames, "read", frozen)
     with pytest.raises(RigError, match="frame camera: sent exactly the image of the picture befo"):
         calibrate.see_boards(here, 4)
 

@@ -22,6 +22,7 @@ from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.flows.collecting.test_session import checksums, session, short
 from tests.flows.conftest import take_all
+from tests.patching import put
 
 TRACKS = {"level": "tracks"}
 
@@ -227,7 +228,7 @@ def test_an_arm_slower_than_it_was_told_is_taken_again(tmp_path: Path, part: flo
         slower = replace(segment, speed_mm_s=0.8)
         start([slower] if part == 1.0 else [at, slower])
 
-    work.rig.arm.start = slow  # type: ignore[method-assign]
+    put(work.rig.arm, "start", slow)
     take_all(work)
     assert slowed == [True]
     assert (work.taken, work.retaken) == (2, 1)

@@ -40,6 +40,7 @@ from tests.conftest import ROOT
 from tests.flows.collecting.test_faults import slides
 from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import requested, take_all, tiny, tiny_gravity
+from tests.patching import put
 from tests.plugins.view.test_view import Read
 
 TIMING = {"force": {"grade": "host time", "delay": {"shortest_us": 0, "longest_us": 4000}}}
@@ -360,7 +361,7 @@ def test_a_watched_trial_presses_to_its_force_and_stays_as_deep(tmp_path: Path) 
         sent.append(rig.plate_frame.position(path[0].to.xyz_mm).depth_mm)
         start(path)
 
-    rig.arm.start = started  # type: ignore[method-assign]
+    put(rig.arm, "start", started)
     watch = Watch()
     run_watched(rig, work.plan.program(trial), watch, 1, 100, None)
     held = np.concatenate([chunk.force_n[:, 2] for chunk in watch.forces[:20]])
@@ -396,7 +397,7 @@ def test_a_limit_of_force_stops_the_arm_on_its_way(tmp_path: Path) -> None:
         stop()
         clear.append(work.rig.position().depth_mm)
 
-    work.rig.arm.stop = stopped  # type: ignore[method-assign]
+    put(work.rig.arm, "stop", stopped)
     with pytest.raises(RigError, match=r"above limits.force = 1 N of the rig; the arm was stopped"):
         take_all(work)
     # before the 2.4 mm to which the trial would press, and clear of the plate afterwards

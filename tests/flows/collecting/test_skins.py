@@ -33,6 +33,7 @@ from tests.conftest import ROOT
 from tests.flows.collecting.test_session import session, short
 from tests.flows.collecting.test_watches import begin, with_references
 from tests.flows.conftest import write
+from tests.patching import put
 from tests.storage.trial_files import campaign as plain_campaign
 
 
@@ -88,7 +89,7 @@ def test_depth_zero_is_found_again_with_another_skin(tmp_path: Path) -> None:
         zeros.append(len(campaign.committed()))
         return found(*given)
 
-    work.rig.rezero = rezero  # type: ignore[method-assign]
+    put(work.rig, "rezero", rezero)
     trials = pending_trials(work.plan, campaign)
     work.take(trials[:2])
     add_note(store, "", context={"temperature": "24 degC"})

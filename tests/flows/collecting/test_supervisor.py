@@ -26,6 +26,7 @@ from tests.conftest import ROOT
 from tests.crash import campaign as crash
 from tests.flows.collecting.test_session import checksums, session, short
 from tests.flows.conftest import requested
+from tests.patching import put
 
 
 def supervised(
@@ -114,8 +115,8 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     work, campaign, store = supervised(tmp_path / "a", data)
     done: list[str] = []
     press, touch_off = work.rig.press, work.rig.touch_off
-    work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
-    work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
+    put(work.rig, "press", lambda *given: (done.append("warm up"), press(*given))[1])
+    put(work.rig, "touch_off", lambda *given: (done.append("zero"), touch_off(*given))[1])
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["warm up", "zero"] * 2

@@ -22,13 +22,14 @@ from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.detect.detecting import RIG
 from tests.flows.detect.test_named import Recording
+from tests.patching import loose
 
 
 def test_live_evidence_is_the_stored_one_to_the_bit(
     document: Path, protocol: Path, tmp_path: Path
 ) -> None:
     source, out = named_source(str(document), None, None), tmp_path / "d.jsonl"
-    assert source.level == source.skin.level  # type: ignore[union-attr]
+    assert source.level == loose(source.skin).level
     order = make_detect_request(RIG, None, protocol=protocol, trial="", detector=source)
     recording = Recording(str(document))
     result = detect(order, out, detector=AtLevel(recording, source.level), show=False)
@@ -39,7 +40,7 @@ def test_live_evidence_is_the_stored_one_to_the_bit(
     again = detect(order, tmp_path / "again.jsonl", show=False)
     assert again["states"] == result["states"]
     assert again["promise"] is not None
-    assert again["promise"]["per_hour"] == source.skin.hold.high  # type: ignore[union-attr]
+    assert again["promise"]["per_hour"] == loose(source.skin).hold.high
 
 
 @pytest.mark.long  # `test_named` has another detector in its process

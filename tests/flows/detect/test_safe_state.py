@@ -28,6 +28,7 @@ from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
 from tests.flows.detect.detecting import keeping, scripted, slip_when_busy, stands_clear, untrained
+from tests.patching import loose, put
 
 RIG = ROOT / "rigs" / "mock_gripper.yaml"
 STREAM_MS, DECISION_MS = 200.0, 100.0
@@ -92,7 +93,7 @@ def test_a_lost_stream_tightens_the_grip_and_the_arm_stays(gripping: Gripping) -
             return here
 
         nothing = EventChunk(*(np.empty(0, t) for t in (np.uint16, np.uint16, np.uint8, np.int64)))
-        rig.events.read = lambda: nothing if silent() else read()  # type: ignore[method-assign]
+        put(rig.events, "read", lambda: nothing if silent() else read())
         rig.events.read_pulses = (  # type: ignore[method-assign]
             lambda: type(pulses())(np.empty(0, np.int64)) if silent() else pulses()
         )
@@ -134,8 +135,8 @@ def test_a_stream_that_lags_more_and_more_leads_to_the_safe_state(gripping: Grip
         return lagging
 
     def disturb(rig: Rig) -> None:
-        rig.events.read = slowed(rig.events.read, rig)  # type: ignore[method-assign]
-        rig.events.read_pulses = slowed(rig.events.read_pulses, rig)  # type: ignore[method-assign]
+        put(rig.events, "read", slowed(rig.events.read, rig))
+        put(rig.events, "read_pulses", slowed(rig.events.read_pulses, rig))
 
     error, rig = safe_state(gripping(), quiet, disturb)
     assert "neither events nor pulses" in error.cause
@@ -234,7 +235,7 @@ def test_events_that_stop_or_freeze_stop_a_reflex_trial(
             return chunk[:0]
 
         stamps = [0]
-        rig.events.read = events  # type: ignore[method-assign]
+        put(rig.events, "read", events)
         rig.events.read_pulses = (  # type: ignore[method-assign]
             lambda: type(pulses())(np.empty(0, np.int64)) if lost() else pulses()
         )
@@ -286,7 +287,7 @@ def test_a_grip_stops_the_arm_and_goes_as_deep_as_was_said(gripping: Gripping) -
     # the next trial begins with open fingers
     rig = rigs[0]
     rig.connect()
-    rig.begin_trial(order.plan.program(order.trial).home, 1)  # type: ignore[union-attr, arg-type]
+    rig.begin_trial(loose(order.plan).program(order.trial).home, 1)
     assert rig.gripper.state().opening_mm == pytest.approx(40.0)
 
 

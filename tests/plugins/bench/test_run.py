@@ -17,6 +17,7 @@ from sliplab.plugins.bench.entries.thresholds import EventRate
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
 from tests.command_line import here
+from tests.patching import loose
 from tests.plugins.bench.made import InThisProcess
 
 TINY = Size(ScenePart(1, 2, 0), ScenePart(1, 3, 0), ScenePart(2, 2, 0), 1)
@@ -101,7 +102,7 @@ def test_choices_are_made_before_a_test_scene_is_there(
 
     def choose(*args: object) -> object:
         done.append("chosen")
-        return promised_levels(*args)  # type: ignore[arg-type]
+        return loose(promised_levels)(*args)
 
     monkeypatch.setattr(scenes, "simulated", simulate)
     monkeypatch.setattr(run, "promised_levels", choose)
@@ -142,7 +143,7 @@ def test_a_stopped_run_resumes_with_the_next_detector(
 
     def prepared(detector: InThisProcess, *rest: object) -> object:
         trained.append(type(detector.detector).__name__)
-        return prepare(detector, *rest)  # type: ignore[arg-type]
+        return loose(prepare)(detector, *rest)
 
     monkeypatch.setattr(run, "prepare", prepared)
     found = run.run_bench(["always", "rate", "never"], "small", 1, tmp_path)

@@ -21,6 +21,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.protocols.yaml_file import validate
 from tests.conftest import SMALL
+from tests.patching import loose
 
 WITHIN = {"figure": "slip_duration", "within": "150 ms"}
 
@@ -98,7 +99,7 @@ def test_a_claim_of_each_kind_is_settled_as_it_is() -> None:
         repetitions=36,
     )
     grid = TrialGrid.of(plan)
-    depth = np.array([float(dict(t.condition)["depth"]) for t in grid.trials])  # type: ignore[arg-type]
+    depth = np.array([float(loose(dict(t.condition)["depth"])) for t in grid.trials])
     y = 3000.0 + 600.0 * (depth == 2.4) + np.random.default_rng(1).normal(0, 50, len(depth))
     *_, last = shuffled(plan, y)
     assert [(s.holds, s.refuted) for s in last] == [

@@ -41,6 +41,7 @@ from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.training import Training
 from sliplab.protocols.windows import Windows
 from tests.analysis.networks.test_spiking import FULL, SMALL, TAXELS, TINY, biased, sparse
+from tests.patching import loose
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -226,7 +227,7 @@ def test_the_chips_arithmetic_is_the_networks_in_whole_numbers() -> None:
     for current in currents:
         v = v + current
         low = min(low, int(v.min()))
-        fired = v >= round(float(whole.iaf1.spike_threshold))  # type: ignore[arg-type]  # a tensor
+        fired = v >= round(float(loose(whole.iaf1).spike_threshold))  # a tensor
         spikes.append(fired)
         v = torch.where(fired, 0, v)
     seen = layer_outputs(whole, x[:1])["iaf1"].flatten(1)

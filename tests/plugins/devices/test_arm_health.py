@@ -13,6 +13,7 @@ from sliplab.plugins.devices.abb.settings import AbbSettings
 from sliplab.plugins.devices.ur.fake import VERSION
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth
 from sliplab.rigs.core.fakes import Kind
+from tests.patching import loose
 from tests.plugins.devices.arms import LIMITS
 from tests.plugins.devices.conftest import MakeArm, MakeRobot
 from tests.rigs.waiting import own_address
@@ -37,7 +38,7 @@ def test_a_universal_robot(robot_of: MakeRobot, arm_on: MakeArm) -> None:
 
 def test_an_abb_by_its_web_services() -> None:
     host = own_address()
-    settings = AbbSettings(host=host, rws_port=8080, egm_bind=host, limits=LIMITS)  # type: ignore[arg-type]
+    settings = loose(AbbSettings)(host=host, rws_port=8080, egm_bind=host, limits=LIMITS)
     with FakeAbb(host, 8080, (host, settings.egm_port)) as robot:
         arm = AbbArm(settings)
         with pytest.raises(ArmFault, match="cannot report its health"):
@@ -60,7 +61,7 @@ def test_an_abb_by_its_web_services() -> None:
 def test_an_abb_behind_a_socket_server() -> None:
     host = own_address()
     with FakeRapidServer(host):
-        arm = AbbSocketArm(AbbSocketSettings(host=host, limits=LIMITS))  # type: ignore[arg-type]
+        arm = AbbSocketArm(loose(AbbSocketSettings)(host=host, limits=LIMITS))
         arm.connect()
         try:
             assert arm.health().model == INFO.decode()

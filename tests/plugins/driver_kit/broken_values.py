@@ -27,6 +27,7 @@ from sliplab.rigs.core.capabilities import ArmState, Pose, Progress
 from sliplab.rigs.core.driver import Driver
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.storage.streams import EventChunk, PoseChunk
+from tests.patching import put
 from tests.plugins.driver_kit.broken import Broken
 from tests.protocols.planning import rows
 
@@ -266,11 +267,11 @@ class LastSegmentOnly(ExampleArm):
     def start(self, path: Any) -> None:
         """Start a path whose last segment lies within the limits."""
         last, check = path[-1:], self._guard.check
-        self._guard.check = lambda begin, path: check(begin, last)  # type: ignore[method-assign]
+        put(self._guard, "check", lambda begin, path: check(begin, last))
         try:
             super().start(path)
         finally:
-            self._guard.check = check  # type: ignore[method-assign]
+            put(self._guard, "check", check)
 
 
 def averaged(chunk: PoseChunk) -> PoseChunk:

@@ -13,6 +13,7 @@ import pytest
 
 from sliplab.storage.formats.recognition import kind_of, skipped_in
 from sliplab.storage.trials.recording import Recording
+from tests.patching import loose
 from tests.plugins.adapters.adapter_streams import some_frames, write_frames
 from tests.storage.formats.files import SMALL, lab_cells, taken
 
@@ -74,7 +75,7 @@ def test_pickles_and_stream_of_one_recording_are_one_trial(
         UNIX * 10**6 + 10_000,
     )
     assert _warnings(found) == ()
-    assert found.record.imported.meta["tip"] == "IncUndExt_v1"  # type: ignore[union-attr]
+    assert loose(found.record.imported).meta["tip"] == "IncUndExt_v1"
     assert skipped_in(run / place, kind_of(run / place)) == []
 
 
@@ -93,7 +94,7 @@ def test_polarity_of_an_overwritten_file_alone_is_unknown(tmp_path: Path) -> Non
     events = _run(tmp_path / "run")
     np.save(events / f"{STEM}_events_on", lab_cells(SMALL, OFF), allow_pickle=True)
     result, (found,) = taken(tmp_path / "store", tmp_path / "run")
-    assert "polarity" in found.record.imported.unknown  # type: ignore[union-attr]
+    assert "polarity" in loose(found.record.imported).unknown
     assert "may hold the OFF events" in _warnings(found)[0]
     assert result["warnings"]
 
@@ -170,7 +171,7 @@ def test_outside_video_has_its_times(tmp_path: Path, times: int, count: int) -> 
     assert found.frame_times().tolist() == expected
     assert len(list(found.frames())) == count
     assert any("paired from the first one on" in text for text in _warnings(found)) == (times != 4)
-    assert "clock of frames" in found.record.imported.unknown  # type: ignore[union-attr]
+    assert "clock of frames" in loose(found.record.imported).unknown
 
 
 def test_unreadable_video_times_and_meta_leave_the_events(tmp_path: Path) -> None:
@@ -185,7 +186,7 @@ def test_unreadable_video_times_and_meta_leave_the_events(tmp_path: Path) -> Non
     texts = " ".join(_warnings(found))
     assert "meta.json is not read" in texts
     assert f"tactip_out_{STEM}.mkv is no video that can be read" in texts
-    assert found.record.imported.left_out == [f"event_stream_{STEM}.mp4"]  # type: ignore[union-attr]
+    assert loose(found.record.imported).left_out == [f"event_stream_{STEM}.mp4"]
     (run / "timestamps_tactip_out.pkl").write_bytes(b"cos\nsystem\n(V/nowhere\ntR.")
     (tmp_path / "again").mkdir()
     _, (again,) = taken(tmp_path / "again" / "store", run)
@@ -213,6 +214,6 @@ def test_force_file_becomes_a_stream(tmp_path: Path, form: str) -> None:
     forces = found.wrenches("force")
     assert forces.t_ns.tolist() == [0, 1_000_000]
     assert forces.force_n.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert found.record.imported.dropped == {  # type: ignore[union-attr]
+    assert loose(found.record.imported).dropped == {
         "rows of force with a value that is not a number": 1
     }

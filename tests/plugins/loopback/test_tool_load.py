@@ -18,6 +18,7 @@ from sliplab.rigs.core.capabilities import Mounting, Pose
 from sliplab.rigs.core.fake_motion import StraightMotion
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.storage.clockmap import ClockMap
+from tests.patching import loose
 from tests.plugins.simulation.test_force import QUIET, go_to, move
 
 OFFSET_S = 400.0
@@ -76,13 +77,13 @@ def test_a_load_is_known_as_far_as_the_scene_has_come(pressed: tuple[Any, ToolLo
 
 def test_before_any_load_nothing_is_known() -> None:
     devices = build_mock(MockSettings(force={}))
-    load = ToolLoad(devices.world, devices.force, CONTROLLER, 50.0)  # type: ignore[arg-type]
+    load = loose(ToolLoad)(devices.world, devices.force, CONTROLLER, 50.0)
     assert load.at(OFFSET_S) is None
 
 
 def test_a_load_beyond_the_range_is_reported_once() -> None:
     devices = build_mock(MockSettings(force=QUIET))
-    load = ToolLoad(devices.world, devices.force, CONTROLLER, 1.0)  # type: ignore[arg-type]
+    load = loose(ToolLoad)(devices.world, devices.force, CONTROLLER, 1.0)
     assert devices.force is not None
     devices.force.start()
     go_to(devices, 2.4)
@@ -108,7 +109,7 @@ def controller(load: Later) -> tuple[UrProgram, Client]:
     still = StraightMotion(Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     program = UrProgram(still, 800.0, [0.0] * 6, lambda t_s: 0, lambda kind: None)
     program.tool_load = load
-    client = Client(None)  # type: ignore[arg-type]
+    client = loose(Client)(None)
     names = b"timestamp,actual_TCP_force,output_int_register_2"
     assert client.ask_outputs(struct.pack(">d", 500.0) + names, 500) == (
         b"\x01DOUBLE,VECTOR6D,INT32"
@@ -149,7 +150,7 @@ def test_a_load_is_taken_for_zero_from_the_time_of_the_request_on() -> None:
 
 def test_a_packet_without_the_load_waits_for_nothing() -> None:
     program, _ = controller(Later())
-    client = Client(None)  # type: ignore[arg-type]
+    client = loose(Client)(None)
     client.ask_outputs(struct.pack(">d", 500.0) + b"timestamp", 500)
     client.cycle(program, 7.0)
     (body,) = client.packets(program)

@@ -18,6 +18,7 @@ from sliplab.plugins.reflex.robotiq_2f.settings import Robotiq2fSettings
 from sliplab.rigs.core.capabilities import Gripper, RigError
 from sliplab.rigs.core.driver import GripperScene
 from sliplab.rigs.core.finger_motion import FingerMotion
+from tests.patching import loose, put
 from tests.rigs.waiting import until
 
 MS = 1_000_000
@@ -128,7 +129,7 @@ def test_steps_are_rounded_to_the_wider_weaker_and_slower_side() -> None:
 
 def test_an_opening_that_was_asked_for_comes_back_the_same() -> None:
     for model in ("2F-85", "2F-140"):
-        allowed = protocol.range_of(model)  # type: ignore[arg-type]
+        allowed = loose(protocol).range_of(model)
         for counts in range(256):
             opening = protocol.opening_mm(counts, allowed)
             assert protocol.position_counts(opening, allowed) == counts
@@ -165,7 +166,7 @@ def test_silence_and_a_broken_line_are_said_in_time(bench: Bench) -> None:
 
 
 def test_an_answer_to_another_question_is_no_answer(bench: Bench) -> None:
-    bench.fake.answer = lambda line: b"ackack STA 3\n"  # type: ignore[method-assign]
+    put(bench.fake, "answer", lambda line: b"ackack STA 3\n")
     with pytest.raises(RigError, match=r"answered b'STA 3' to GET FLT"):
         bench.gripper.state()
 
@@ -199,7 +200,7 @@ def answer_with(bench: Bench, name: str, wrong: bytes) -> list[str]:
         sent.append(line.strip())
         return wrong if line.strip() == f"GET {name}" else right(line)
 
-    bench.fake.answer = answer  # type: ignore[method-assign]
+    put(bench.fake, "answer", answer)
     return sent
 
 

@@ -18,6 +18,7 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.faults import KINDS, AnyFault
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
+from tests.patching import loose
 from tests.plugins.simulation.driving import SMALL, Trial, go, gravity, same, slide, with_faults
 from tests.protocols.planning import rows
 
@@ -210,7 +211,7 @@ def test_a_full_disk_stays_full_for_the_trial() -> None:
     devices = with_faults({"kind": "disk_full", "since": "trial", "at_s": 1.0, "trial": 1})
     devices.begin_trial(1)
     bare = Sink()
-    sink: Any = devices.sink(bare)  # type: ignore[arg-type]
+    sink: Any = devices.sink(loose(bare))
     sink.add("frames", None)
     devices.clock.wait(1.0)
     for _ in range(2):
@@ -219,7 +220,7 @@ def test_a_full_disk_stays_full_for_the_trial() -> None:
         assert caught.value.errno == errno.ENOSPC
     assert bare.written == 1
     devices.begin_trial(2)
-    assert devices.sink(bare) is bare  # type: ignore[arg-type]
+    assert devices.sink(loose(bare)) is bare
 
 
 # -- how they are written ------------------------------------------------------------------

@@ -34,6 +34,7 @@ from sliplab.plugins.twin.pilots import simulate_pilot
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from tests.conftest import ROOT
+from tests.patching import loose
 
 RING = np.repeat([0, 1, 2], [1, 6, 12])
 ANGLE = np.concatenate([np.arange(n) * 2 * np.pi / n for n in (1, 6, 12)])
@@ -102,7 +103,7 @@ def pilot(tracks: Callable[[float], Tracks], **others: object) -> list[PilotTria
     """Slides at three depths and three speeds in four directions; `tracks` by depth."""
     ways = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]
     return [
-        slide(tracks(depth), speed, way, depth, seed=number, **others)  # type: ignore[arg-type]
+        loose(slide)(tracks(depth), speed, way, depth, seed=number, **others)
         for number, (depth, speed, way) in enumerate(
             (depth, speed, way)
             for depth in (2.4, 2.8, 3.4)

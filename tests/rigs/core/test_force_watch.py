@@ -19,6 +19,7 @@ from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import WrenchChunk
+from tests.patching import loose, put
 
 MS = 1_000_000
 PLATE = PlateFrame.taught(((0.0, 0.0, 0.0), (50.0, 0.0, 0.0), (0.0, 50.0, 0.0)))
@@ -51,7 +52,7 @@ def readings(
 
 
 def watch(*chunks: WrenchChunk, delay_s: float = 0.0005) -> ForceWatch:
-    found: Any = ForceWatch(Scripted(*chunks), PLATE, None, delay_s)  # type: ignore[arg-type]
+    found: Any = ForceWatch(loose(Scripted(*chunks)), PLATE, None, delay_s)
     for _ in chunks:
         found.read()
     return found
@@ -182,7 +183,7 @@ def read_in_a_press(limit_n: float | None) -> list[np.ndarray]:
 
     with rig.safely(home):
         rig.begin_trial(home, 5)
-        sensor.read = noted  # type: ignore[method-assign]
+        put(sensor, "read", noted)
         rig._watch_forces()
         rig.take_step(0, Move("press", Position(0.0, 0.0, 2.8), 1.0), home, None)
     rig.close()

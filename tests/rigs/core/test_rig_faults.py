@@ -10,6 +10,7 @@ import pytest
 from sliplab.protocols import load_plan
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from tests.conftest import ROOT
+from tests.patching import put
 from tests.rigs.core.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
 
 STOPS = ["arm.stop", "events.stop", "frames.stop", "sync.stop"]
@@ -52,7 +53,7 @@ def test_whoever_stops_the_rig_hears_that_the_arm_could_not_be(error: BaseExcept
         wait(1.0)
         raise error
 
-    sink.keep_events = slow_disk  # type: ignore[method-assign]
+    put(sink, "keep_events", slow_disk)
     notes = watched(rig)
     with pytest.raises(ArmFault, match="does not answer") as caught:
         run(rig, short_plan(), sink)
@@ -145,7 +146,7 @@ def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped(rig: Any) -> N
             raise KeyboardInterrupt
         stop()
 
-    rig.arm.stop = interrupted  # type: ignore[method-assign]
+    put(rig.arm, "stop", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(rig, short_plan(), Memory(fail_after=3, error=KeyboardInterrupt()))
     assert rig.arm.state() is ArmState.READY
@@ -173,7 +174,7 @@ def test_ctrl_c_while_the_arm_moves_clear_stops_it(rig: Any) -> None:
         failed[0] = sink.calls >= 3
         keep(chunk)
 
-    sink.keep_events = full  # type: ignore[method-assign]
+    put(sink, "keep_events", full)
     rig.arm.start, rig.clock.wait = noted, interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         run(rig, short_plan(), sink)
@@ -194,8 +195,8 @@ def test_an_arm_that_does_not_come_clear_is_told_of(rig: Any) -> None:
         raise OSError("disk full")
 
     sink = Memory()
-    sink.keep_events = full  # type: ignore[method-assign]
-    rig.arm.start = hindered  # type: ignore[method-assign]
+    put(sink, "keep_events", full)
+    put(rig.arm, "start", hindered)
     with pytest.raises(ArmFault, match="did not come clear of the plate"):
         run(rig, short_plan(), sink)
 
@@ -206,7 +207,7 @@ def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others(rig: Any) -> 
     def broken() -> None:
         raise ValueError("a library's own")
 
-    rig.events.stop = broken  # type: ignore[method-assign]
+    put(rig.events, "stop", broken)
     notes: list[str] = []
     stop = rig.sync.stop
     rig.sync.stop = lambda: (notes.append("sync.stop"), stop())[1]  # type: ignore[method-assign, func-returns-value]

@@ -14,6 +14,7 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.core.teaching import Creep, grab_frames, jog_poses, press_in_circles, touch
 from sliplab.rigs.core.touching import RateTouch
 from sliplab.storage.streams import FrameChunk
+from tests.patching import put
 from tests.rigs.altered import depths
 from tests.rigs.core.test_rig import after_the_stop, make_rig, watched
 
@@ -92,7 +93,7 @@ def test_an_arm_that_runs_on_is_stopped_at_the_limit() -> None:
             path = [type(path[-1])(far, path[-1].speed_mm_s)]
         start(path)
 
-    rig.arm.start = overshoots  # type: ignore[method-assign]
+    put(rig.arm, "start", overshoots)
     notes = watched(rig)
     with pytest.raises(RigError, match="hard limit"):
         touch(rig, 0.0, 0.0, QUICK, 1)
@@ -110,7 +111,7 @@ def test_an_arm_that_somebody_else_stops_is_not_blamed_on_the_plane(when: int) -
             rig.arm.stop()  # at the pendant, say
         return 0
 
-    rig.central_events = seen  # type: ignore[method-assign]
+    put(rig, "central_events", seen)
     with pytest.raises(ArmFault, match="stopped from outside, at -"):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert depth(rig) <= -1.5 + 1e-6
@@ -150,7 +151,7 @@ def test_ctrl_c_stops_the_arm_first(rig: Rig) -> None:
             raise KeyboardInterrupt
         return count()
 
-    rig.central_events = interrupted  # type: ignore[method-assign]
+    put(rig, "central_events", interrupted)
     with pytest.raises(KeyboardInterrupt):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert notes.index("arm.stop") < notes.index("events.stop")
@@ -213,13 +214,13 @@ def test_a_person_jogs_and_confirms(rig: Rig) -> None:
 
 
 def test_a_person_who_says_stop_is_heard(rig: Rig) -> None:
-    rig.operator.ask = lambda task, prompt, expected: False  # type: ignore[method-assign]
+    put(rig.operator, "ask", lambda task, prompt, expected: False)
     with pytest.raises(StopRequested):
         jog_poses(rig, [("", "touched centre")])
 
 
 def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose(rig: Rig) -> None:
-    rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
+    put(rig.operator, "ask", lambda task, prompt, expected: True)
     rig.arm.start([Segment(rig.plate_frame.pose(Position(0.0, 0.0, -20.0)), 5.0)])
     with pytest.raises(RigError, match="is still moving"):
         jog_poses(rig, [("", "touched centre")])

@@ -35,6 +35,7 @@ from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
 from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 from tests.conftest import ROOT
+from tests.patching import loose, put
 from tests.rigs.altered import alter, before, depths
 
 LIMIT_N = 0.6
@@ -85,7 +86,7 @@ class Watcher(NullSink):
 
 def deaf(rig: Rig) -> Rig:
     """The rig, to which no touch shows in the events."""
-    rig.central_events = lambda: 0  # type: ignore[method-assign]
+    put(rig, "central_events", lambda: 0)
     return rig
 
 
@@ -125,7 +126,7 @@ each_motion = pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: moti
 
 def true_forces(rig: Rig) -> list[float]:
     """Keep the true normal force at every look at the arm's pose."""
-    world, found = rig.force._world, [0.0]  # type: ignore[union-attr]
+    world, found = loose(rig.force)._world, [0.0]
 
     def look() -> None:
         if world.physics.wrench is not None:
@@ -181,7 +182,11 @@ def test_limit_of_force_holds_while_the_arm_rests_after_a_reflex() -> None:
     rig, watcher = make_rig(limit_n=4.0), Watcher(slip=True)
     pushed = [0.0]
     alter(rig.force, "read", lambda chunk: replace(chunk, force_n=chunk.force_n + pushed[0]))
-    watcher.step = lambda phase, acting: pushed.append(pushed.pop() + 3.0 * (phase == "reflex"))  # type: ignore[method-assign]
+    put(
+        watcher,
+        "step",
+        lambda phase, acting: pushed.append(pushed.pop() + 3.0 * (phase == "reflex")),
+    )
     with pytest.raises(ForceLimitError):
         run_watched(rig, PROGRAM, watcher, 1, 100, Reflex("stop", 4.0, hold_s=1.0))
     assert pushed == [3.0]
@@ -332,7 +337,7 @@ def test_sensor_that_dies_in_mid_slide_stops_the_arm(motion: Any, how: str) -> N
 def test_sensor_whose_normal_axis_is_dead_stops_a_press(motion: Any, mounting: Mounting) -> None:
     """Its other two axes are noisy, and show what acts on them."""
     rig = make_rig(limit_n=30.0)
-    rig.force.mounting = mounting  # type: ignore[union-attr]
+    loose(rig.force).mounting = mounting
     breaks(rig, "stuck normal")
     deepest = depths(rig)
     with pytest.raises(RigError, match=r"force sensor: reads the same normal force since the arm"):
@@ -544,7 +549,7 @@ def test_arm_faster_than_the_limit_is_stopped_by_its_poses() -> None:
     rig = plain_rig()
     rig.guard = Guard(None, replace_limits(rig, speed_mm_s=10.0))
     start = rig.arm.start
-    rig.arm.start = lambda path: start([replace(path[0], speed_mm_s=60.0)])  # type: ignore[method-assign]
+    put(rig.arm, "start", lambda path: start([replace(path[0], speed_mm_s=60.0)]))
     with pytest.raises(SpeedError, match=r"speed 60 mm/s is beyond its limit 10 mm/s"):
         rig.move(Move("home", Position(0.0, 0.0, -50.0), 10.0), rig.position())
 
@@ -553,7 +558,7 @@ def test_turn_faster_than_the_limit_is_stopped_by_its_poses() -> None:
     rig = home_rig()
     rig.guard = Guard(None, replace_limits(rig, speed_mm_s=5.0))
     start = rig.arm.start
-    rig.arm.start = lambda path: start([replace(path[0], turn_deg_s=100.0)])  # type: ignore[method-assign]
+    put(rig.arm, "start", lambda path: start([replace(path[0], turn_deg_s=100.0)]))
     limit = f"{rig.guard.turn_deg_s:.4g}"
     with pytest.raises(SpeedError, match=rf"turn 100 deg/s is beyond its limit {limit} deg/s"):
         rig.twist(Twist("twist", replace(HOME, twist_deg=90.0), 20.0), HOME)
@@ -662,12 +667,12 @@ def test_touching_off_by_an_arm_that_never_arrives_ends() -> None:
             x, y, z = stood[0].xyz_mm
             noise = np.random.default_rng(1)
             arm._lie = lambda _: Pose((x + noise.normal(0, 1e-3), y, z), stood[0].rotvec_deg)
-            arm.progress = lambda: replace(progress(), done=False)  # type: ignore[attr-defined]
-            arm.stop = lambda: arm.__dict__.pop("progress", None)  # type: ignore[attr-defined]
+            put(arm, "progress", lambda: replace(progress(), done=False))
+            put(arm, "stop", lambda: arm.__dict__.pop("progress", None))
         else:
             start(path)
 
-    rig.arm.start = begin  # type: ignore[method-assign]
+    put(rig.arm, "start", begin)
     with pytest.raises(ArmFault, match="did not finish touching off in time"):
         rig.touch_off(1.0, 2.4, 1)
 
@@ -800,7 +805,7 @@ def test_gripper_whose_state_cannot_be_used_keeps_a_trial_from_its_start(
     state: GripperState, said: str
 ) -> None:
     rig = make_rig("mock-gripper", None)
-    rig.gripper.state = lambda: state  # type: ignore[method-assign]
+    put(rig.gripper, "state", lambda: state)
     deepest = depths(rig)
     with pytest.raises(RigError, match=f"gripper: {said}"):
         trial(rig)
@@ -856,7 +861,7 @@ def test_real_camera_without_any_noise_is_refused_before_the_approach() -> None:
     rig = plain_rig()
     rig.simulation = None
     rig.events.start()
-    rig.events.read = lambda: nothing(EventChunk(*[np.zeros(1, np.int64)] * 4))  # type: ignore[method-assign]
+    put(rig.events, "read", lambda: nothing(EventChunk(*[np.zeros(1, np.int64)] * 4)))
     with pytest.raises(RigError, match=r"event camera: sent no event within 0\.5 s, not even"):
         rig.measure_noise()
 

@@ -14,6 +14,7 @@ from sliplab.plugins.devices.basler.fake_live import LiveBasler
 from sliplab.plugins.devices.basler.settings import BaslerSettings
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.streams import FrameChunk
+from tests.patching import put
 from tests.rigs.waiting import gather, until
 
 pytestmark = pytest.mark.realtime
@@ -139,6 +140,6 @@ def test_a_scene_that_is_gone_does_not_keep_the_camera_from_stopping(
     def gone() -> None:
         raise RigError("stand-ins", "have ended")
 
-    scene.stop_grabbing = gone  # type: ignore[method-assign]
+    put(scene, "stop_grabbing", gone)
     camera.stop()
     assert not camera.device.IsGrabbing()

@@ -24,6 +24,7 @@ from sliplab.plugins.devices.dvxplorer.source import (
 )
 from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.storage.streams import I64, EventChunk
+from tests.patching import loose
 from tests.rigs.waiting import until
 
 pytestmark = pytest.mark.realtime
@@ -298,7 +299,7 @@ def test_a_camera_is_set_by_names_that_the_library_has() -> None:
     assert done["setContrastThresholdOn"] == 12
     assert "setContrastThresholdOff" not in done
     readouts = UsbCamera.model_fields["readout"].annotation
-    for readout in readouts.__args__:  # type: ignore[union-attr]
+    for readout in loose(readouts).__args__:
         configure(Recorder(), UsbCamera(readout=readout))
 
 

@@ -22,6 +22,7 @@ from sliplab.plugins.devices.sync_box.settings import SyncBoxSettings
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.pulse_code import code_bits
+from tests.patching import put
 from tests.rigs.waiting import fault_of
 
 pytestmark = pytest.mark.realtime
@@ -199,12 +200,12 @@ def test_a_garbled_answer_to_go_loses_no_pulse(wire: FakeSyncBox, box: SerialSyn
 
     def garble_go(body: str) -> None:
         if body.startswith("OK GO"):
-            wire._say = say  # type: ignore[method-assign]
+            put(wire, "_say", say)
             wire.corrupt(1)
         say(body)
 
     box.connect()
-    wire._say = garble_go  # type: ignore[method-assign]
+    put(wire, "_say", garble_go)
     box.start(200.0, SEED)
     pulses = pulses_of(box, 30)
     ticks = pulses // 5_000_000
@@ -362,7 +363,7 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
     wire: FakeSyncBox, box: SerialSyncBox
 ) -> None:
     running(box, 200.0, 5)
-    wire._say = lambda body: os.write(wire._master, b"no line at all\n") and None  # type: ignore[method-assign]
+    put(wire, "_say", lambda body: os.write(wire._master, b"no line at all\n") and None)
     assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S + SLACK_S)
     assert box.losses.lines > 10
 
@@ -410,7 +411,7 @@ def test_a_garbled_exposure_far_ahead_costs_one(wire: FakeSyncBox, box: Any, us:
     def garble_fifth(body: str) -> None:
         say(f"X 5 {us}" if body.startswith("X 5 ") else body)
 
-    wire._say = garble_fifth  # type: ignore[method-assign]
+    put(wire, "_say", garble_fifth)
     box.start(200.0, SEED)
     exposures = gather(lambda: box.read_exposures().t_ns, lambda found: len(found) >= 20)
     box.stop()

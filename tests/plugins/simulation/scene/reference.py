@@ -20,6 +20,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from sliplab.plugins.simulation.scene.friction import KNOT_MM
 from sliplab.plugins.simulation.scene.springs import NORMAL_BRANCH, Springs, Tips
+from tests.patching import put
 
 RTOL, ATOL = 1e-11, 1e-13
 
@@ -191,7 +192,7 @@ class _Law:
         def ends(_: float, y: np.ndarray) -> float:
             return self.excess(t, y, 1.0)
 
-        ends.terminal = True  # type: ignore[attr-defined]
+        put(ends, "terminal", True)
         found = solve_ivp(flow, (0, 5), y, method="DOP853", rtol=RTOL, atol=ATOL, events=ends)
         return found.y[:, -1]
 

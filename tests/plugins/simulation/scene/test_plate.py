@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sliplab.plugins.simulation.scene.springs import SLIPPED, STUCK, Springs, Tips, new_tips
+from tests.patching import put
 from tests.plugins.simulation.scene.steps import MU, H, fall, ideal_skin, run, slid, times
 from tests.plugins.simulation.scene.steps import springs_of as skin_springs
 
@@ -207,7 +208,7 @@ class Hanging:
                     return -1.0
                 return float((self.force(t, y, slips) - MU * self.normal(t))[ring])
 
-            ends.terminal = True  # type: ignore[attr-defined]
+            put(ends, "terminal", True)
             return ends
 
         return self.solve(flow, [lets_go(ring) for ring in range(3)], t, y)
@@ -218,7 +219,7 @@ class Hanging:
         def lands(_: float, y: np.ndarray) -> float:
             return float(y[0]) + 25.0
 
-        lands.terminal = True  # type: ignore[attr-defined]
+        put(lands, "terminal", True)
         # the rates have corners where the weight is whole and where the retraction begins
         corners = [c for c in (self.ramp_s, self.ramp_s + self.still_s, 10.0) if c > t + 1e-12]
         how = {"rtol": 1e-10, "atol": 1e-11} | how

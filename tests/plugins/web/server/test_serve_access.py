@@ -20,6 +20,7 @@ from sliplab.plugins.web.server import page_server
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
+from tests.patching import loose
 from tests.plugins.web.server.serving import EVIL, Service, serving, until
 from tests.rigs.waiting import free_port
 
@@ -131,11 +132,11 @@ def test_websockets_are_as_closed(served: Service, path: str) -> None:
     assert served.handshake(path, Origin=EVIL) == 403
     assert served.handshake(path, Host=f"evil.example:{served.port}") == 403
     for message in ({"type": "auth", "token": "sliplab:guess"}, {"type": "auth"}, {"type": "x"}):
-        with connect(f"ws://{served.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+        with connect(f"ws://{served.host}{path}", subprotocols=loose(["prefect"])) as line:
             line.send(json.dumps(message))
             with pytest.raises(ConnectionClosed):
                 line.recv(timeout=30)
-    with connect(f"ws://{served.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+    with connect(f"ws://{served.host}{path}", subprotocols=loose(["prefect"])) as line:
         line.send(json.dumps({"type": "auth", "token": served.page.password}))
         assert json.loads(line.recv(timeout=30))["type"] == "auth_success"
 
