@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from prefect import flow
 
 from sliplab.analysis.campaigns import Collected, need_slip
 from sliplab.analysis.evaluation import networks
-from sliplab.analysis.evaluation.networks import Engines, Judgement, network_of
+from sliplab.analysis.evaluation.networks import CountedBy, Engines, Judgement, network_of
 from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms, summaries
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
-from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import run
 from sliplab.flows.running.parallel_map import keep_trials
 from sliplab.flows.running.run_records import timed
@@ -51,7 +50,6 @@ class NetworkScores(StepResult):
 
     Attributes:
         model: the network as text.
-        same_as_sinabs: the engine gives the counts of Sinabs.
         margin: of the rule, in spikes, by campaign.
         accuracy, interval: of the sample windows.
         false_alarms: an hour of quiet holding; None without slides.
@@ -59,8 +57,7 @@ class NetworkScores(StepResult):
     """
 
     model: str
-    engine: Engines | Literal["predictions"]
-    same_as_sinabs: bool
+    engine: CountedBy
     simulated: bool
     margin: dict[str, float]
     accuracy: Accuracy
@@ -94,11 +91,6 @@ def judge_model(
     need_slip(campaigns)
     network, labels = network_of(model, engine), StoreLabels(store, reviewed)
     judgement = networks.file_judgement(labels, campaigns, network, margin, smoothing)
-    if network.engine == "fast" and not network.exact:
-        console.say(
-            f"warning: {network.title}: its weights are off the grid, where the fast engine's "
-            "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
-        )
     return _scores(judgement, cluster)
 
 
@@ -140,7 +132,6 @@ def _scores(judgement: Judgement, cluster: Cluster | None) -> NetworkScores:
         "fresh": int(not done),
         "model": network.title,
         "engine": network.engine,
-        "same_as_sinabs": network.exact or network.engine == "sinabs",
         "simulated": store.simulated,
         "margin": {name: rule.margin for name, rule in judgement.rules.items()},
         "accuracy": found.windows.accuracy,

@@ -22,12 +22,10 @@ from sliplab.analysis.evaluation.windows import intervals_of
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
-from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
+from sliplab.analysis.networks.external_model import ExternalModel, load_external, names_function
 from sliplab.analysis.networks.models import comparison_models, rules_of, training_settings
 from sliplab.analysis.networks.network import spike_counts
-from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sparse import SparseWindows
@@ -46,6 +44,7 @@ from sliplab.storage.trials.store import Store, StoreError
 STEP = "other_networks"
 VERSION = 1
 Engines = Literal["fast", "sinabs"]
+CountedBy = Engines | Literal["function", "predictions"]
 I64 = npt.NDArray[np.int64]
 
 
@@ -56,28 +55,27 @@ class OtherNetwork:
     Attributes:
         name: of the stored results, safe as a file name.
         title: for people.
-        content: its file's bytes: a model file of this program, or weights of `description`.
+        content: its file's bytes.
+        external: of another program; None for a model file of this one.
         windows: what it takes.
         outputs_per_class: in the mean.
-        engine: counts its spikes: the event-driven kernels, or Sinabs; ``predictions`` where
-            another program did.
-        exact: whether both give the same counts by arithmetic.
+        engine: counts its spikes: the event-driven kernels, Sinabs, which gives the same counts, or
+            a function of another program; ``predictions`` where that did it before.
     """
 
     name: str
     title: str
     content: bytes
-    description: Description | None
+    external: ExternalModel | None
     windows: Windows
     outputs_per_class: float
-    engine: Engines | Literal["predictions"]
-    exact: bool
+    engine: CountedBy
 
     @cached_property
     def key(self) -> str:
         """Hash of the file and the engine, on which its counts depend."""
-        stated = None if self.description is None else self.description.model_dump(mode="json")
-        return hash_data([self.content.hex(), stated, self.engine])
+        mark = None if self.external is None else self.external.fingerprint
+        return hash_data([self.content.hex(), mark, self.engine])
 
 
 @dataclass(frozen=True)
@@ -94,18 +92,19 @@ class _Judging:
 
 
 def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
-    """Return a network to evaluate from a model file, or from a state_dict with its description.
+    """Return a network to evaluate from a model file, or from a function of another program.
 
     Args:
-        path: the model file, the description (YAML or JSON), or the weights with a description of
-            the same name in the same folder.
-        engine: by default the kernels where they give Sinabs' counts by arithmetic, else Sinabs.
+        path: the model file, or ``FILE.py:FUNCTION`` (`networks.external_model`).
+        engine: of a model file: the kernels by default; Sinabs gives the same counts.
 
     Raises:
         InputError: file, key, value and what would be right.
     """
-    if path.suffix.lower() in {".yaml", ".yml", ".json"}:
-        return _described(path, engine)
+    if names_function(path):
+        if engine is not None:
+            raise InputError("--engine", "", engine, f"is of model files; {path} is a function")
+        return _external(load_external(path))
     try:
         content = read_plain(path)
     except OSError as error:
@@ -113,17 +112,9 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
     try:
         fitted = model_file.parse(content, str(path))
     except ValueError as error:
-        for suffix in (".yaml", ".yml", ".json"):
-            if path.with_suffix(suffix).exists():
-                return _described(path.with_suffix(suffix), engine)
         reason = str(error).removeprefix(f"{path}: ")
-        raise InputError(
-            path,
-            "",
-            None,
-            f"{reason}; a state_dict needs a description next to it, such as "
-            f"{path.with_suffix('.yaml').name} (docs/models.md)",
-        ) from None
+        right = "give a network of another program as FILE.py:FUNCTION (docs/models.md)"
+        raise InputError(path, "", None, f"{reason}; {right}") from None
     fitted.check_slip(path, "an evaluation of slip")
     return OtherNetwork(
         f"model-{path.stem}",
@@ -133,35 +124,18 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
         fitted.windows,
         fitted.network.outputs_per_class,
         engine or "fast",
-        exact=True,
     )
 
 
-def _described(path: Path, engine: Engines | None) -> OtherNetwork:
-    model = load_external(path)
-    if model.description.classes != CLASSES:
-        raise InputError(
-            path,
-            "classes",
-            list(model.description.classes),
-            f"must be {', '.join(CLASSES)} for an evaluation of slip",
-        )
-    exact = model.on_grid()
-    if engine == "fast":
-        try:
-            model.fast()
-        except ValueError as error:
-            reason = f"cannot run {path}: {error}; use sinabs"
-            raise InputError("--engine", "", engine, reason) from None
+def _external(model: ExternalModel) -> OtherNetwork:
     return OtherNetwork(
-        f"model-{path.stem}",
-        Path(model.description.weights).name,
-        model.weights,
-        model.description,
+        f"model-{model.file.stem}-{model.function}",
+        f"{model.file.name}:{model.function}",
+        model.source,
+        model,
         model.windows,
         model.outputs_per_class,
-        engine or ("fast" if exact else "sinabs"),
-        exact,
+        "function",
     )
 
 
@@ -276,7 +250,6 @@ def comparison_judgements(labels: StoreLabels, campaigns: list[Collected]) -> li
             settings.windows,
             settings.network.outputs_per_class,
             "fast",
-            exact=True,
         )
         rules = {
             item.name: settings.detection.model_copy(
@@ -327,7 +300,7 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     network = judging.network
     if judging.threads is not None:
         training.limit_threads(judging.threads)
-    counts = _counter(network.content, network.description, network.engine)
+    counts = _counter(network.content, network.external, network.engine)
     windows, end_ns = dataset.trial_windows(recording, network.windows, judging.stride_ms)
     found = {"counts": counts(windows), "end_ns": end_ns}
     if judging.label is not None:
@@ -341,20 +314,16 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
 
 @lru_cache(maxsize=2)
 def _counter(
-    content: bytes, description: Description | None, engine: str
+    content: bytes, external: ExternalModel | None, engine: CountedBy
 ) -> Callable[[SparseWindows], I64]:
     """A function from windows to output spikes int64 (n, 3), each window from rest."""
-    if description is None:
-        fitted = model_file.parse(content, "the model")
-        if engine == "fast":
-            return fitted.engine.counts
-        net = training.restore(fitted)
-        return lambda x: spike_counts(net, x.dense())
-    model = ExternalModel(description, content)
+    if external is not None:
+        return lambda x: external.counts(x.dense())
+    fitted = model_file.parse(content, "the model")
     if engine == "fast":
-        return SpikeEngine(model.fast(), model.windows.cells).counts
-    sinabs = model.sinabs()
-    return lambda x: sinabs.counts(x.dense())
+        return fitted.engine.counts
+    net = training.restore(fitted)
+    return lambda x: spike_counts(net, x.dense())
 
 
 def score_network(job: Judgement) -> None:
@@ -381,7 +350,7 @@ def score_network(job: Judgement) -> None:
         data_key=job.data_key,
         title=network.title,
         engine=network.engine,
-        exact=network.exact,
+        exact=True,
         **job.about,
         windows=_windows(counts, labels, places, margin),
         trials=tuple(rows),

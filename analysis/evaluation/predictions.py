@@ -149,7 +149,6 @@ def prediction_judgement(
         settings.windows,
         settings.network.outputs_per_class,
         "predictions",
-        exact=True,
     )
     judgement = file_judgement(labels, campaigns, network, margin, smoothing)
     return PredictionJudgement(**vars(judgement), outputs=outputs, scale=_SCALE[kind])

@@ -112,14 +112,14 @@ def evaluate(
         Path | None,
         typer.Option(
             "--model",
-            help="Score this model instead of the store's: a model file, a Sinabs state_dict "
-            "with its description, or a .json of `sliplab calibrate detector`.",
+            help="Score this model instead of the store's: a model file, FILE.py:FUNCTION of "
+            "another program, or a .json of `sliplab calibrate detector`.",
         ),
     ] = None,
     engine: Annotated[
         Engine | None,
         typer.Option(
-            "--engine", help="Engine for --model; default: fast where its counts equal Sinabs'."
+            "--engine", help="Engine of a model file; the counts are the same. Default: fast."
         ),
     ] = None,
     predictions: Annotated[
@@ -217,10 +217,9 @@ def _model_scores(result: NetworkScores) -> dict[str, str | int]:
         sure = (
             f" ({interval.low:.1%} to {interval.high:.1%} over {plural(interval.trials, 'trial')})"
         )
-    differ = "" if result["same_as_sinabs"] else "; a few counts may differ from Sinabs'"
     shown: dict[str, str | int] = {
         "windows": f"{accuracy.n} of {plural(interval.trials, 'trial')}",
-        "engine": f"{result['engine']}{differ}",
+        "engine": result["engine"],
     }
     if accuracy.n:
         shown |= {

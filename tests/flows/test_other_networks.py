@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +30,6 @@ from sliplab.protocols import InputError
 from sliplab.protocols.windows import Windows
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
-from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
 from tests.flows.conftest import summary_json
 
@@ -40,14 +39,43 @@ def store(own_study: Store) -> Store:
     return own_study
 
 
-def lab(folder: Path, step: float = 0.1, **changes: Any) -> Path:
-    """A lab's network in plain Sinabs, for windows of the store: its two files."""
-    net = papers(step, cells=20, steps=30)
-    torch.save(net.state_dict(), folder / "lab.pt")
-    data = {"model": 1, "weights": "lab.pt", "layers": OURS, **changes}
-    path = folder / "lab.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return path
+LAB = """
+import torch
+from sinabs.activation import MembraneReset, SingleSpike
+from sinabs.layers import IAFSqueeze
+from torch import nn
+
+
+def neurons():
+    return IAFSqueeze(num_timesteps=30, spike_fn=SingleSpike, reset_fn=MembraneReset())
+
+
+torch.manual_seed(0)
+net = nn.Sequential(
+    nn.Conv2d(1, 4, 5, padding=2, bias=False), neurons(),
+    nn.Conv2d(4, 6, 3, stride=2, padding=1, bias=False), neurons(),
+    nn.Flatten(), nn.Linear(600, 16), neurons(), nn.Linear(16, 3), neurons(),
+)
+with torch.no_grad():
+    for value in net.parameters():
+        if value.ndim:  # a threshold has none
+            value.copy_(value * 4)
+
+
+def network(x):
+    for layer in net:
+        if isinstance(layer, IAFSqueeze):
+            layer.reset_states()
+    with torch.no_grad():
+        spikes = net(torch.from_numpy(x).float().flatten(0, 1))
+    return spikes.unflatten(0, (len(x), -1)).sum(dim=1)
+"""
+
+
+def lab(folder: Path) -> str:
+    """A lab's network in plain Sinabs, for windows of the store."""
+    (folder / "lab.py").write_text(LAB)
+    return f"{folder / 'lab.py'}:network"
 
 
 def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
@@ -95,47 +123,33 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
 
 
 @pytest.mark.long
-def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
-    store: Store, tmp_path: Path
-) -> None:
-    path, campaigns = lab(tmp_path), collected(store)
-    done = here("evaluate", store.folder, "--model", tmp_path / "lab.pt", "--json")
+def test_a_labs_network_is_asked_for_its_counts(store: Store, tmp_path: Path) -> None:
+    place, campaigns = lab(tmp_path), collected(store)
+    done = here("evaluate", store.folder, "--model", place, "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
-    assert (said["engine"], said["same_as_sinabs"], said["margin"]["tiny"]) == ("sinabs", True, 2.0)
-    net = papers(0.1, cells=20, steps=30)
+    assert (said["engine"], said["margin"]["tiny"]) == ("function", 2.0)
+    network = runpy.run_path(str(tmp_path / "lab.py"))["network"]
     test = load_samples(StoreLabels(store), campaigns, "test")
-    expected = by_hand(net, test.x, 16)
+    expected = network(test.x).numpy().astype(np.int64)
     assert said["accuracy"] == metrics.accuracy(expected, test.y, 2.0).to_json()
     assert len(np.unique(expected, axis=0)) > 3
     for item in campaigns:
-        kept = Derived.of(store, "counts-model-lab", item.name)
+        kept = Derived.of(store, "counts-model-lab-network", item.name)
         for _, recording in item.of_split("test"):
             x, end_ns = trial_windows(recording, Windows())
             arrays = kept.arrays(recording.folder.name)
-            np.testing.assert_array_equal(arrays["counts"], by_hand(net, x.dense(), 50))
+            np.testing.assert_array_equal(arrays["counts"], network(x.dense()).numpy())
             np.testing.assert_array_equal(arrays["end_ns"], end_ns)
     # again there is nothing to do, and the report has a column more
-    assert judge_model(store, campaigns, path)["done"] == 0
+    assert judge_model(store, campaigns, Path(place))["done"] == 0
     assert report(store, campaigns)["done"] == 1
     page = (store.folder / "report" / "index.html").read_text()
-    assert "lab.pt (simulated)" in page
+    assert "lab.py:network (simulated)" in page
     assert "88 ms after onset" in page
     assert "measured by its authors on their own robot" in " ".join(page.split())
     assert "paper preset (simulated)" in page
-
-
-@pytest.mark.long
-def test_the_kernels_say_where_they_may_differ(store: Store, tmp_path: Path) -> None:
-    lab(tmp_path)
-    done = here("evaluate", store.folder, "--model", tmp_path / "lab.yaml", "--engine", "fast")
-    assert done.returncode == 0, done.stderr
-    assert "may differ from Sinabs'" in done.stderr
-    on_grid = judge_model(store, collected(store), lab(tmp_path, 2.0**-6))
-    assert (on_grid["engine"], on_grid["same_as_sinabs"]) == ("fast", True)
-    slow = judge_model(store, collected(store), lab(tmp_path, 2.0**-6), "sinabs")
-    assert slow["accuracy"] == on_grid["accuracy"]
-    assert slow["latency_ms"] == on_grid["latency_ms"]
+    assert "a function of another program" in page
 
 
 def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None:
@@ -146,19 +160,22 @@ def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None
     assert Derived.of(store, STEP).read("model-seed0")["trials"] == own["trials"]
 
 
+def test_sinabs_gives_the_counts_of_the_kernels(store: Store) -> None:
+    path = store.folder / "models" / "seed0.pt"
+    fast, slow = (judge_model(store, collected(store), path, how) for how in ("fast", "sinabs"))
+    assert slow["accuracy"] == fast["accuracy"]
+    assert slow["latency_ms"] == fast["latency_ms"]
+
+
 def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
     campaigns = collected(store)
     with pytest.raises(InputError, match=r"lab\.pt: cannot be read"):
         judge_model(store, campaigns, tmp_path / "lab.pt")
-    path = lab(tmp_path, windows={"length_ms": 30, "pool_px": 40})
-    with pytest.raises(InputError, match=r"lab\.pt: 5\.weight = \[16, 600\]: .* layers\[5\]"):
-        judge_model(store, campaigns, path)
-    path.unlink()
-    with pytest.raises(InputError, match=r"needs a description next to it, such as lab\.yaml"):
+    torch.save({"weight": torch.ones(3)}, tmp_path / "lab.pt")
+    with pytest.raises(InputError, match=r"a network of another program as FILE\.py:FUNCTION"):
         judge_model(store, campaigns, tmp_path / "lab.pt")
-    layers = [*OURS[:3], {**OURS[3], "lowest": -1.0}, *OURS[4:]]
-    with pytest.raises(InputError, match=r"--engine = fast: .*no lowest potential; use sinabs"):
-        judge_model(store, campaigns, lab(tmp_path, layers=layers), "fast")
+    with pytest.raises(InputError, match=r"--engine = fast: is of model files"):
+        judge_model(store, campaigns, Path(lab(tmp_path)), "fast")
     done = here("evaluate", store.folder, "--engine", "fast")
     assert done.returncode == 2
     assert "--engine = fast: belongs to --model" in done.stderr
