@@ -35,6 +35,9 @@ WEAKEST = 2.0**-8
 LEAD, IDLE = 0.6, 0.15
 """Current of the regression's choice above the mean class, and of the mean class, in thresholds a
 step."""
+STRONGEST = 4.0
+"""Largest weight of a spike, in thresholds: a taxel that fires in few windows has a steep slope,
+and sums of weights must stay exact (`networks.network.EXACT`)."""
 SPREAD = 0.3
 """Of the gains of a class's neurons, between the first and beyond the last, relative."""
 CHUNK = 256
@@ -82,7 +85,8 @@ def begin(net: nn.Sequential, x: SparseWindows, y: Labels) -> None:
     for output in range(outputs):
         kind, copy = output % classes, output // classes
         scale = unit * (1.0 + SPREAD * ((copy + 0.5) / copies - 0.5))
-        values["fc1.weight"][output] = torch.from_numpy(scale * slope[:, kind]).float()
+        steep = np.clip(scale * slope[:, kind], -STRONGEST, STRONGEST)
+        values["fc1.weight"][output] = torch.from_numpy(steep).float()
         drive = (offset[kind] - scores.mean()) * scale / steps + IDLE
         values["fc1.bias"][output] = float(drive)
     values["fc2.weight"].zero_()

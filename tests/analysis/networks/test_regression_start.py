@@ -11,7 +11,7 @@ import torch
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import regression_start
 from sliplab.analysis.networks.baselines import fit_logistic
-from sliplab.analysis.networks.network import build, matrices, spike_counts
+from sliplab.analysis.networks.network import build, exact, matrices, on_grid, spike_counts
 from sliplab.analysis.networks.spiking import SpikeEngine
 from sliplab.analysis.networks.training import fit, restore
 from sliplab.analysis.windows.sparse import SparseWindows
@@ -76,6 +76,15 @@ def test_dense_events_are_weighted_less() -> None:
     weights = [event_weight(begun(rate)[0]) for rate in (0.03, 0.3, 60.0)]
     assert weights[0] == weights[1] == regression_start.PASSED
     assert weights[2] < 0.1
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.0005])
+def test_few_events_or_none_give_weights_that_are_exact(rate: float) -> None:
+    net, x, _ = begun(rate)
+    values = on_grid(matrices(net))
+    assert all(np.isfinite(value).all() for value in values)
+    assert exact(values)
+    assert SpikeEngine(net, 1).counts(x).max() < STEPS * 4
 
 
 def test_training_keeps_it_and_gives_an_ordinary_network() -> None:
