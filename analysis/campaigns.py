@@ -254,7 +254,7 @@ def class_names(campaigns: list[Collected]) -> tuple[str, ...]:
     if not any(item.recorded and item.recorded.adapter.classes for item in campaigns):
         names = tuple(sorted(names, key=natural))
     if len(names) < 2:
-        raise StoreError(f"recordings of {len(names)} classes; at least two are needed to train")
+        raise StoreError(f"{len(names)} class in the recordings; at least two are needed to train")
     return names
 
 

@@ -36,6 +36,7 @@ from sliplab.analysis.trial_work import EachTrial, KeepTrials, in_order
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.network_settings import MOST_CHANNELS
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import import_foreign
 from sliplab.storage.files import write_bytes, write_json
@@ -101,7 +102,7 @@ class Problem(ABC):
         """Check that a network can be trained here.
 
         Raises:
-            InputError: there is no such device to train on.
+            InputError: there is no such device to train on, or there are too many outputs.
         """
 
     @abstractmethod
@@ -191,6 +192,13 @@ class EventProblem(Problem):
             right = f"not available here; must be one of {', '.join(there)}"
             file = item.campaign.protocol_file
             raise InputError(file, "analysis.training.device", device, right)
+        network, classes = item.settings.network, self.models()[0].classes or CLASSES
+        if network.start == "regression" and (
+            (outputs := network.outputs_per_class * len(classes)) > MOST_CHANNELS
+        ):
+            right = f"gives {outputs} outputs with {len(classes)} classes; {MOST_CHANNELS} at most"
+            key, file = "analysis.network.outputs_per_class", item.campaign.protocol_file
+            raise InputError(file, key, network.outputs_per_class, right)
 
     def train(
         self, model: ModelOnDisk, train: SampleSet, validation: SampleSet, watch: Watch

@@ -161,12 +161,12 @@ def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
     folder, part = Path(request.place), request.part
     opened = open_store(folder)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
-    if part in campaigns:
-        return opened, campaigns[part], sorted(campaigns[part].committed())
     wanted = request.options.get("campaign") or [*campaigns]
     if unknown := [each for each in wanted if each not in campaigns]:
         text = f"is no campaign of {folder}; campaigns: {', '.join(campaigns)}"
         raise InputError("--campaign", "", unknown[0], text)
+    if part in campaigns:
+        return opened, campaigns[part], sorted(campaigns[part].committed())
     holders = [each for each in opened.holders(part) if each.name in wanted]
     if len(holders) != 1:
         text = (

@@ -178,10 +178,15 @@ class AnalysisSettings(StrictModel):
 
 def _begun_by_data(data: dict[str, Any]) -> dict[str, Any]:
     """Return the section with the start of a network of taxels, where it says nothing of that."""
-    windows, network = data.get("windows"), data.get("network", {})
-    taxels = windows.get("taxels") if isinstance(windows, dict) else None
-    if not isinstance(taxels, int) or 2 * taxels > MOST_CHANNELS or not isinstance(network, dict):
+    given, network = data.get("windows"), data.get("network", {})
+    if not (isinstance(given, dict) and given.get("taxels") and isinstance(network, dict)):
         return data
-    if network.keys() & (SIZES | {"start", "biases"}):
+    if network.keys() & (SIZES | {"start"}) or not network.get("biases", True):
+        return data
+    try:
+        windows = Windows.model_validate(given)
+    except ValueError:  # whose faults are reported later
+        return data
+    if windows.channels > MOST_CHANNELS:
         return data
     return {**data, "network": {"start": "regression", **network}}

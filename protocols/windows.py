@@ -24,10 +24,17 @@ class Windows(StrictModel):
     """Taxels of a sensor that has no image: each is a channel, of each polarity one, and a sample
     has a single cell. `crop_px` and `pool_px` are then left out. null: the square crop."""
 
+    parts: int = Field(default=1, ge=1, le=1000, exclude_if=lambda value: value == 1)
+    """Equal parts of a window of taxels, each with channels of its own: a network then knows when
+    in the window an event was, if recordings begin with the touch."""
+
     @rule
     def _fits(self) -> Windows:
         if self.length_ms % self.step_ms:
             raise KeyedError("analysis.windows.step_ms", self.step_ms, "must divide length_ms")
+        if self.parts > self.steps:
+            right = f"must not exceed the {self.steps} steps of a window"
+            raise KeyedError("analysis.windows.parts", self.parts, right)
         if self.taxels is not None:
             for name in ("crop_px", "pool_px"):
                 value = getattr(self, name)
@@ -37,6 +44,8 @@ class Windows(StrictModel):
                         value,
                         f"must be left out with taxels = {self.taxels}: taxels have no crop",
                     )
+        elif self.parts > 1:
+            raise KeyedError("analysis.windows.parts", self.parts, "needs taxels")
         elif self.crop_px % self.pool_px:
             raise KeyedError("analysis.windows.pool_px", self.pool_px, "must divide crop_px")
         return self
@@ -58,8 +67,12 @@ class Windows(StrictModel):
 
     @property
     def channels(self) -> int:
-        """The polarities, of each taxel where there are taxels."""
-        return self.polarities * (self.taxels or 1)
+        """The polarities, of each taxel and part where there are taxels."""
+        return self.polarities * (self.taxels or 1) * self.parts
+
+    def part(self, step: int) -> int:
+        """Return the part of a window that a step is in."""
+        return step * self.parts // self.steps
 
 
 class SampleSettings(StrictModel):

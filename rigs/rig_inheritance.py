@@ -106,11 +106,14 @@ def read_rig(path: Path) -> RigSource:
 
 
 def _parent_file(here: Path, parent: str) -> Path:
-    """Return the file that `extends` names: a path from the file's folder, or a shipped rig."""
+    """Return the file that `extends` names: a path from the file's folder, or a shipped rig.
+
+    Shipped rigs name each other as files, and so does a copy of one elsewhere.
+    """
     there = here.parent / parent
-    if os.path.exists(there):
+    if os.path.exists(there) and not _same(there, here):
         return there
-    return shipped_rigs().get(parent.replace("-", "_"), there)
+    return shipped_rigs().get(parent.removesuffix(".yaml").replace("-", "_"), there)
 
 
 def rig_yaml(data: dict[str, Any]) -> str:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -30,6 +30,8 @@ from sliplab.storage.files import read_plain
 I64 = npt.NDArray[np.int64]
 BATCH = 64
 """Windows that the function gets at a time."""
+MOST = 1_000_000
+"""Spikes of a class in a window."""
 TRIED, SHARE = 16, 0.05
 """Windows by which a changed network is noticed, and their events of a cell and step."""
 
@@ -74,18 +76,19 @@ class ExternalModel:
         return np.concatenate([np.empty((0, len(CLASSES)), np.int64), *parts])
 
     def _batch(self, x: npt.NDArray[np.uint8]) -> I64:
+        called = _function(self.file, self.function, self.source)
         try:
-            called = _function(self.file, self.function, self.source)
-            found = np.asarray(called(x.copy()), np.float64)
-        except Exception as error:
+            with redirect_stdout(sys.stderr):  # what is printed there may be read by a program
+                found = np.asarray(called(x.copy()), np.float64)
+        except (Exception, SystemExit) as error:
             said = f"failed on windows {x.shape}: {type(error).__name__}: {error}"
             raise InputError(self.place, "", None, said) from error
         expected = (len(x), len(CLASSES))
         if found.shape != expected:
             said = f"returned the shape {found.shape}; must be {expected}, spikes of each class"
             raise InputError(self.place, "", None, said)
-        if not (np.isfinite(found).all() and (found >= 0).all() and (found % 1 == 0).all()):
-            said = "returned numbers that are no counts of spikes; must be whole, 0 or more"
+        if not ((found >= 0) & (found <= MOST) & (found % 1 == 0)).all():  # NaN is none of these
+            said = f"returned numbers that are no counts of spikes; must be whole, 0 to {MOST}"
             raise InputError(self.place, "", None, said)
         return found.astype(np.int64)
 
@@ -105,15 +108,18 @@ def load_external(place: Path) -> ExternalModel:
     except OSError as error:
         raise InputError(file, "", None, f"cannot be read: {error.strerror}") from None
     called = _function(file, function, source)
-    windows = validate(Windows, dict(getattr(called, "windows", {})), f"{place}.windows")
-    outputs = float(getattr(called, "outputs_per_class", 1))
-    if not 0 < outputs < 1e6:
-        raise InputError(place, "outputs_per_class", outputs, "must be above 0")
-    model = ExternalModel(file, function, source, windows, outputs)
+    stated = getattr(called, "windows", {})
+    if not isinstance(stated, dict):
+        raise InputError(place, "windows", stated, "must be a mapping of keys to values")
+    windows = validate(Windows, dict(stated), f"{place}.windows")
+    outputs = getattr(called, "outputs_per_class", 1)
+    if isinstance(outputs, bool) or not isinstance(outputs, (int, float)) or not 0 < outputs < 1e6:
+        raise InputError(place, "outputs_per_class", outputs, "must be a number above 0")
+    model = ExternalModel(file, function, source, windows, float(outputs))
     shape = (TRIED, windows.steps, windows.channels, windows.cells, windows.cells)
     tried = np.random.default_rng(0).poisson(SHARE, shape).astype(np.uint8)
     mark = hash_data([source.hex(), model.counts(tried).tolist()])
-    return ExternalModel(file, function, source, windows, outputs, mark)
+    return replace(model, fingerprint=mark)
 
 
 @lru_cache(maxsize=4)
@@ -123,15 +129,14 @@ def _function(file: Path, name: str, source: bytes) -> Callable[[Any], Any]:
     assert spec is not None
     module = module_from_spec(spec)
     folder = str(file.resolve().parent)
-    sys.path.insert(0, folder)  # as of a script: it may import its neighbours
+    if folder not in sys.path:
+        sys.path.append(folder)  # it may import its neighbours, also when it is called
     try:
-        exec(compile(source, str(file), "exec"), module.__dict__)
-    except Exception as error:
+        with redirect_stdout(sys.stderr):
+            exec(compile(source, str(file), "exec"), module.__dict__)
+    except (Exception, SystemExit) as error:
         said = f"cannot be loaded: {type(error).__name__}: {error}"
         raise InputError(file, "", None, said) from error
-    finally:
-        with suppress(ValueError):
-            sys.path.remove(folder)
     found = getattr(module, name, None)
     if not callable(found):
         raise InputError(file, "", name, "must be a function in this file")

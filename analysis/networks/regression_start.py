@@ -19,7 +19,7 @@ from sliplab.analysis.metrics.classification import Labels
 from sliplab.analysis.networks.baselines import fit_logistic
 from sliplab.analysis.networks.network import classes_of, set_weights, weights
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.protocols.network_settings import NetworkSettings
+from sliplab.protocols.network_settings import MOST_CHANNELS, NetworkSettings
 from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import F64
 
@@ -54,7 +54,7 @@ def sized(network: NetworkSettings, windows: Windows, classes: int) -> NetworkSe
         "conv2_channels": windows.channels,
         "conv1_kernel": 1,
         "conv2_kernel": 1,
-        "hidden": classes * network.outputs_per_class + SPARE,
+        "hidden": min(classes * network.outputs_per_class + SPARE, MOST_CHANNELS),
         "weight_scale": (1.0, 1.0, 1.0, 1.0),
     }
     return NetworkSettings.model_validate({**network.model_dump(), **sizes})

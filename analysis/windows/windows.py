@@ -8,6 +8,7 @@ through at tens of millions a second on one core.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ def bin_events(
 
     An event counts in the window [start, start + length), in step ``(t - start) // step``, in the
     cell of ``pool`` x ``pool`` pixels of the square crop that holds its pixel. With taxels all of
-    the sensor counts: taxel ``row * width + column`` is a channel, and there is one cell.
+    the sensor counts: taxel ``row * width + column`` is a channel, and there is one cell; each part
+    of a window has channels of its own, one part's after the other's.
 
     Args:
         events: k of them, sorted by time; pixels may be integers of any kind, polarity also bool or
@@ -62,7 +64,12 @@ def bin_events(
         *columns, starts, settings.step_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
     )
     _raise_for_status(state, columns, width, height)
-    return out.reshape(shape)
+    if settings.parts == 1:
+        return out.reshape(shape)
+    found = np.zeros((*shape[:2], settings.parts, math.prod(out.shape[2:])), np.uint8)
+    for step in range(settings.steps):
+        found[:, step, settings.part(step)] = out[:, step].reshape(len(out), found.shape[3])
+    return found.reshape(shape)
 
 
 def list_events(
@@ -105,7 +112,11 @@ def list_events(
         count,
     )
     _raise_for_status(state, columns, width, height)
-    return SparseWindows(shape, offsets, cell[: offsets[-1]].copy(), count[: offsets[-1]].copy())
+    cell, count = cell[: offsets[-1]].copy(), count[: offsets[-1]].copy()
+    if settings.parts > 1:
+        first = [settings.part(step) * (plane.size - 1) for step in range(settings.steps)]
+        cell += np.repeat(np.tile(np.array(first, np.uint32), starts.size), np.diff(offsets))
+    return SparseWindows(shape, offsets, cell, count)
 
 
 _CODES = {"negative": 0, "positive": 1, "both": 2}

@@ -69,11 +69,16 @@ def finish(result: Mapping[str, object], title: str, as_json: bool) -> None:
     if as_json:
         console.print_json(result)
         return
-    shown = {
-        key: ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
-        for key, value in result.items()
-    }
-    console.print_pairs(title, shown)
+    console.print_pairs(title, {key: _shown(value) for key, value in result.items()})
+
+
+def _shown(value: object) -> object:
+    """Return a value of a result as a person reads it."""
+    if isinstance(value, list):
+        return ", ".join(str(_shown(each)) for each in value) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown(each)}" for name, each in value.items()) or "none"
+    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:

@@ -36,7 +36,7 @@ def record(
         list[str],
         typer.Argument(
             metavar="STREAMS",
-            help="Rig files, files of streams, lsl:NAME, usb:DEVICE; NAME= before it names it.",
+            help="Rig files, files of streams, lsl:STREAM, usb:DEVICE, or NAME=lsl:STREAM.",
         ),
     ],
     store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
@@ -118,6 +118,7 @@ def record(
             "salvaged": recorder.salvaged,
             "lost": session.lost,
             "faults": session.faults,
+            "warnings": session.warnings,
         }
     finish(result, f"recorded into {store}", as_json)
     if early is not None:
@@ -134,6 +135,7 @@ class _Session:
         key: returns the next key; None without a terminal.
         length_s, every_s: of the whole, and of each trial; None without a limit.
         lost: rows that are known to be lost, by stream. faults: of streams, and empty trials.
+        warnings: what else is worth a look.
     """
 
     recorder: Recorder
@@ -144,6 +146,7 @@ class _Session:
     trial: RecordedTrial | None = None
     lost: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     _recorded_s: float = 0.0
     """Of the trials before."""
     _shown: float = 0.0
@@ -178,7 +181,7 @@ class _Session:
         try:
             trial.close()
         finally:
-            self.faults += trial.faults.values()
+            self.faults += [f"trial {trial.id}: {fault}" for fault in trial.faults.values()]
             if trial.record is not None and not any(trial.rows().values()):
                 self.faults.append(f"trial {trial.id}: nothing came from any stream")
             for name, count in trial.lost().items():
@@ -191,6 +194,7 @@ class _Session:
                 *(f"{count} {what}" for what, count in about.dropped.items()),
                 *about.warnings,
             ):
+                self.warnings.append(f"trial {trial.id}: {text}")
                 console.say(f"  {text}")
 
     def _answer(self, key: str) -> bool:

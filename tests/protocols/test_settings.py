@@ -48,6 +48,7 @@ def test_taxels_are_channels_of_one_cell() -> None:
     found = Windows(length_ms=250, taxels=39, polarity="both")
     assert (found.steps, found.channels, found.cells) == (250, 78, 1)
     assert Windows(taxels=39).channels == 39
+    assert Windows(taxels=39, parts=3).channels == 117
     assert found.model_dump()["taxels"] == 39
     assert Windows.model_validate(found.model_dump()) == found
     assert found != Windows(length_ms=250, polarity="both")
@@ -92,6 +93,8 @@ def test_what_does_not_go_with_a_start_by_regression(
         ({"taxels": 39, "crop_px": 200}, "crop_px", "must be left out with taxels = 39"),
         ({"taxels": 39, "pool_px": 1}, "pool_px", "must be left out with taxels = 39"),
         ({"taxels": 39, "length_ms": 5, "step_ms": 2}, "step_ms", "must divide length_ms"),
+        ({"parts": 2}, "parts", "needs taxels"),
+        ({"parts": 9, "taxels": 4, "length_ms": 8}, "parts", "must not exceed the 8 steps"),
         ({"crop_px": 30}, "pool_px", "must divide crop_px"),
     ],
 )

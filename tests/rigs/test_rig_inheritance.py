@@ -74,6 +74,16 @@ def test_a_name_alone_is_a_rig_that_ships_unless_a_file_has_it(base: Path) -> No
     assert rig.frame_source == "video"
 
 
+def test_a_copy_of_a_shipped_rig_extends_what_that_extends(tmp_path: Path) -> None:
+    shipped = (ROOT / "rigs" / "mock_frames.yaml").read_text()
+    assert "extends: mock.yaml" in shipped
+    rig, _ = load_rig_file(child(tmp_path, shipped))
+    assert rig.driver == "mock"
+    # also where the copy has the name of what it extends
+    rig, _ = load_rig_file(child(tmp_path, "extends: mock.yaml\nname: own\n", "mock.yaml"))
+    assert rig.name == "own"
+
+
 def test_a_file_that_extends_nothing_keeps_its_own_text(base: Path) -> None:
     assert load_rig_file(base / "mock.yaml")[1] == MOCK
 
@@ -126,7 +136,7 @@ def test_a_fault_is_blamed_on_the_file_that_has_it(
     ("text", "says"),
     [
         ("extends: none.yaml\n", "extends = none.yaml: no such file"),
-        ("extends: mock_weak.yaml\n", "did you mean 'mock_weak'?"),
+        ("extends: mock_wek.yaml\n", "did you mean 'mock_weak'?"),
         ("extends: child.yaml\n", "extends = child.yaml: is circular"),
         ("extends: [mock.yaml]\n", "must be the path of a rig file"),
         ('extends: "a\\0b"\n', "must be the path of a rig file"),

@@ -18,10 +18,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 TOTALS = """
 import numpy as np
-from neighbour import LEAST
 
 
 def network(x):
+    from neighbour import LEAST
+
+    print("for people")
     total = x.sum(axis=(1, 2, 3, 4))
     return np.stack([total < LEAST, total == LEAST, total > LEAST], axis=1)
 
@@ -42,7 +44,7 @@ def windows(n: int) -> np.ndarray:
     return np.random.default_rng(1).poisson(0.2, (n, 4, 1, 2, 2)).astype(np.uint8)
 
 
-def test_the_function_counts(tmp_path: Path) -> None:
+def test_the_function_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found, x = load_external(written(tmp_path)), windows(150)
     assert found.windows == Windows(length_ms=4, crop_px=40)
     assert (found.outputs_per_class, found.place) == (2.0, f"{tmp_path / 'lab.py'}:network")
@@ -51,6 +53,7 @@ def test_the_function_counts(tmp_path: Path) -> None:
     assert expected.any(axis=0).all()
     np.testing.assert_array_equal(found.counts(x), expected)
     assert found.counts(x[:0]).shape == (0, 3)
+    assert capsys.readouterr().out == ""  # which a program may read
     # as a worker gets it
     again: ExternalModel = pickle.loads(pickle.dumps(found))
     np.testing.assert_array_equal(again.counts(x), expected)
@@ -91,22 +94,39 @@ WRONG = {
     "no counts": (
         "lab.py:network",
         "def network(x):\n    return [[0.5, 0, 0]] * len(x)",
-        "must be whole, 0 or more",
+        "must be whole, 0 to",
     ),
     "NaN": (
         "lab.py:network",
         "def network(x):\n    return [[float('nan'), 0, 0]] * len(x)",
-        "must be whole, 0 or more",
+        "must be whole, 0 to",
+    ),
+    "leaves": ("lab.py:network", "def network(x):\n    raise SystemExit(3)", "SystemExit: 3"),
+    "leaves when loaded": ("lab.py:network", "raise SystemExit(3)", "loaded: SystemExit: 3"),
+    "too many": (
+        "lab.py:network",
+        "def network(x):\n    return [[1e30, 0, 0]] * len(x)",
+        "must be whole, 0 to 1000000",
+    ),
+    "windows as a number": (
+        "lab.py:network",
+        "def network(x):\n    pass\nnetwork.windows = 5",
+        "windows = 5: must be a mapping",
     ),
     "windows": (
         "lab.py:network",
         "def network(x):\n    pass\nnetwork.windows = {'lenght_ms': 30}",
         r"did you mean 'length_ms'",
     ),
+    "outputs as a word": (
+        "lab.py:network",
+        "def network(x):\n    pass\nnetwork.outputs_per_class = 'many'",
+        "outputs_per_class = many: must be a number",
+    ),
     "outputs": (
         "lab.py:network",
         "def network(x):\n    pass\nnetwork.outputs_per_class = 0",
-        "outputs_per_class = 0.0: must be above 0",
+        "outputs_per_class = 0: must be a number above 0",
     ),
 }
 

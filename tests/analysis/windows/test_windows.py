@@ -252,6 +252,15 @@ def test_taxels_are_counted_one_by_one(
     np.testing.assert_array_equal(listed.dense(), got)
     for a, b in zip(listed.offsets[:-1], listed.offsets[1:], strict=True):
         assert (np.diff(listed.cell[a:b].astype(int)) > 0).all()
+    # the same in parts: every step has the channels of its part
+    parted = how.model_copy(update={"parts": min(3, steps)})
+    split = list_events(events, starts, parted, width, height)
+    np.testing.assert_array_equal(split.dense(), bin_events(events, starts, parted, width, height))
+    by_part = split.dense()[..., 0, 0].reshape(5, steps, parted.parts, how.channels)
+    np.testing.assert_array_equal(by_part.sum(axis=2), got[..., 0, 0])
+    for number in range(steps):
+        others = np.delete(by_part[:, number], number * parted.parts // steps, axis=1)
+        assert not others.any()
     # a sample of taxels has no sides to be mirrored along
     mirrored = listed.mirrored(np.arange(5) % 4)
     np.testing.assert_array_equal(mirrored.dense(), got)

@@ -100,4 +100,6 @@ def test_a_trial_of_several_campaigns_is_chosen_by_its_campaign(tmp_path: Path) 
     assert f"{trial}: is in the campaigns copy, small of {store}; choose one by --campaign" in said
     done = here(*asked, "--campaign", "other")
     assert "--campaign = other: is no campaign of" in " ".join(done.stderr.split())
+    done = here("export", store, "small", *asked[3:], "--campaign", "other")
+    assert "--campaign = other: is no campaign of" in " ".join(done.stderr.split())
     assert answer(*asked, "--campaign", "copy")["trials"] == 1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft7Validator
 
+from sliplab.analysis import problem
 from sliplab.analysis.campaigns import class_names, collected
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.labels.reviewed import StoreLabels
@@ -227,11 +228,32 @@ def test_a_class_without_training_recordings_is_named(
     assert "no training windows of cup" in page
 
 
+def test_without_settings_a_network_of_taxels_begins_by_the_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head = adapter()
+    windows = {**head["analysis"]["windows"], "parts": 2}
+    store = class_store(tmp_path / "store", head={**head, "analysis": {"windows": windows}})
+    campaigns = collected(store)
+    label(store, campaigns)
+    with monkeypatch.context() as less:
+        less.setattr(problem, "MOST_CHANNELS", 8)
+        with pytest.raises(InputError, match=r"outputs_per_class = 4: gives \d+ outputs"):
+            train(store, campaigns)
+    train(store, campaigns)
+    fitted = model_file.load(store.folder / "models" / "classes-seed0.pt")
+    channels = 2 * 2 * made.TAXELS
+    assert (fitted.network.conv1_channels, fitted.windows.channels) == (channels, channels)
+    evaluate(store, campaigns)
+    found = class_evaluation_of(store)
+    assert found.scores.accuracy.argmax == 1.0  # each object has a taxel of its own
+
+
 @pytest.mark.parametrize(
     ("trials", "classes", "text"),
     [
         ({"validation": 2, "test": 1}, CLASSES, "there are no training samples"),
-        ({"train": 2, "validation": 1}, ("cup",), "recordings of 1 classes; at least two"),
+        ({"train": 2, "validation": 1}, ("cup",), "1 class in the recordings; at least two"),
     ],
 )
 def test_what_cannot_be_trained_is_said(

@@ -59,6 +59,7 @@ def test_for_and_every_make_trials_of_their_length(tmp_path: Path, streams: Path
         "salvaged": [],
         "lost": {},
         "faults": [],
+        "warnings": [],
     }
     for recording in Store.open(store).campaign("rows").recordings():
         assert recording.record.condition == {"object": "mug", "grip": "2.0 N"}
