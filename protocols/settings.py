@@ -135,6 +135,7 @@ class AnalysisSettings(StrictModel):
                 for each in PAPER
                 if each.key.startswith(f"{section}.")
             }
+        data["network"]["start"] = "random"  # a preset has sizes of its own
         data["training"]["seeds"] = self.training.seeds[:1]
         data["detection"]["compare"] = None
         return AnalysisSettings.model_validate({**data, "preset": self.also, "also": None})

@@ -107,6 +107,7 @@ def load_external(place: Path) -> ExternalModel:
         source = read_plain(file)
     except OSError as error:
         raise InputError(file, "", None, f"cannot be read: {error.strerror}") from None
+    _function.cache_clear()  # it may have read other weights
     called = _function(file, function, source)
     stated = getattr(called, "windows", {})
     if not isinstance(stated, dict):

@@ -61,6 +61,9 @@ def test_a_network_that_begins_as_a_regression_learns_slower() -> None:
     usual = AnalysisSettings().training.learning_rate
     assert found.training.learning_rate == usual / 8
     assert AnalysisSettings.model_validate(found.model_dump(mode="json")) == found
+    compared = AnalysisSettings.model_validate({**data, "also": "paper"}).comparison_settings()
+    assert compared is not None
+    assert (compared.network.start, compared.network.hidden) == ("random", 32)
     sized = AnalysisSettings.model_validate({**data, "network": {"hidden": 32}})
     assert sized.network.start == "random"
     given = AnalysisSettings.model_validate({**data, "training": {"learning_rate": 0.1}})

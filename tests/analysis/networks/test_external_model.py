@@ -63,9 +63,9 @@ def test_other_weights_are_another_network(tmp_path: Path) -> None:
     text = """
 import numpy as np
 from pathlib import Path
+WEIGHTS = np.load(Path(__file__).with_name("w.npy"))
 def network(x):
-    weights = np.load(Path(__file__).with_name("w.npy"))
-    return x.sum(axis=(1, 2, 3, 4))[:, None] * weights
+    return x.sum(axis=(1, 2, 3, 4))[:, None] * WEIGHTS
 network.windows = {"length_ms": 4, "crop_px": 40}
 """
     marks = []
