@@ -87,8 +87,8 @@ def _end_on_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # such as SIGHUP under nohup
             signal.signal(number, end)
-            # registered first, called last; of an ignored signal the interpreter restores nothing
-            atexit.register(signal.signal, number, signal.SIG_IGN)
+        # registered first, called last; of an ignored signal the interpreter restores nothing
+        atexit.register(signal.signal, number, signal.SIG_IGN)
 
 
 def _run() -> int:
