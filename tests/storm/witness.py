@@ -89,6 +89,7 @@ class Witness:
         self._lied: tuple[str, Any] = "", None
         self._lied_s: float | None = None
         self._segment: Segment | None = None
+        self._sent_from: Any = None
         self._misled = False
         self._world: SimulatedWorld | None = None
         self._pass_time: Callable[[SimulatedWorld, int], None]
@@ -178,6 +179,7 @@ class Witness:
             if state is ArmState.PROTECTIVE_STOP:
                 self.wrong("no motion after a stop", f"it is sent on in {state.value}")
             self._segment, self._lied_s, self._blind = path[-1], None, None
+            self._sent_from = _place(arm._world)  # an arm that strays is not where it was sent
             # what is sent from a false pose goes to a false place, which nothing here can know
             self._misled = self._is_false
 
@@ -421,7 +423,7 @@ class Witness:
             bound_s += STUCK_S + STUCK_MM / segment.speed_mm_s + self._poll_s
         elif kind.startswith("force"):
             there = world.plane.sensor(segment.to)
-            straight = self._misled or math.dist(place[:2], there[:2]) < 0.5
+            straight = self._misled or math.dist(self._sent_from[:2], there[:2]) < 0.5
             if straight and there[2] < place[2]:
                 return  # it leaves the plate, whatever the sensor says
             bound_s = SILENT_S
