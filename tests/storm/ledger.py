@@ -356,13 +356,13 @@ class Ledger:
         known = [name for name in references if name in before]
         if not {*known} <= self.trials.keys():
             return
-        drifted = ""
         for note in notes:
             name = note.get("trial", "")
             if note.get("outcome") == "committed" and name in references:
                 known.append(name)
             skin = self._skins.get(known[-1]) if known else None
             alike = [each for each in known if self._skins[each] == skin]
+            drifted = ""
             if len(alike) > 1:
                 first, last = self._rates[alike[0]], self._rates[alike[-1]]
                 far = 100 * abs(last / first - 1) > 1.2 * self._drift_percent
