@@ -372,7 +372,9 @@ class Ledger:
 
     def _check_recorded(self, notes: list[dict[str, Any]], ended: bool) -> None:
         """What was recorded completely is kept; what was not finished is at least set aside."""
-        kept = {*self.trials, *(name.rpartition(".")[0] for name in self.aside)}
+        # what is on its way to quarantine when the power is cut is still among the trials
+        aside = (name.rpartition(".")[0] for name in self.aside)
+        kept = {*self.trials, *self._moving, *aside}
         folder = self._campaign / "incoming"
         incoming = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         for name, sums in self.unfinished.items():

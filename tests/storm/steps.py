@@ -301,6 +301,7 @@ def _file_request(process: Process, wanted: dict[str, Any]) -> None:
     ids = _ids(process, wanted)
     if ids and not store.campaign(NAME).begun:
         return
+    process.notes.add(asks=kind, trials=ids)  # it may be killed before the request has a number
     made = control.ask(store, kind, who="anna", campaign=NAME if ids else "", trials=ids)
     process.notes.add(asked=kind, number=made.number, trials=ids)
 
