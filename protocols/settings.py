@@ -135,7 +135,7 @@ class AnalysisSettings(StrictModel):
                 for each in PAPER
                 if each.key.startswith(f"{section}.")
             }
-        data["network"]["start"] = "random"  # a preset has sizes of its own
+        data["network"]["start"] = "random"  # a preset sets the sizes
         data["training"]["seeds"] = self.training.seeds[:1]
         data["detection"]["compare"] = None
         return AnalysisSettings.model_validate({**data, "preset": self.also, "also": None})
@@ -186,7 +186,7 @@ def _begun_by_data(data: dict[str, Any]) -> dict[str, Any]:
         return data
     try:
         windows = Windows.model_validate(given)
-    except ValueError:  # whose faults are reported later
+    except ValueError:  # its faults are reported later
         return data
     if windows.channels > MOST_CHANNELS:
         return data

@@ -304,8 +304,8 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, Arrays]:
     try:
         windows, end_ns = dataset.trial_windows(recording, network.windows, judging.stride_ms)
     except ValueError as error:
-        said = f"do not fit trial {recording.trial_id}: {error}"
-        raise InputError(network.title, "windows", None, said) from None
+        message = f"do not fit trial {recording.trial_id}: {error}"
+        raise InputError(network.title, "windows", None, message) from None
     found = {"counts": counts(windows), "end_ns": end_ns}
     if judging.label is not None:
         trial = dataset.TrialId(recording.folder.parents[1].name, recording.folder.name)

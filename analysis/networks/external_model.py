@@ -81,15 +81,15 @@ class ExternalModel:
             with redirect_stdout(sys.stderr):  # what is printed there may be read by a program
                 found = np.asarray(called(x.copy()), np.float64)
         except (Exception, SystemExit) as error:
-            said = f"failed on windows {x.shape}: {type(error).__name__}: {error}"
-            raise InputError(self.place, "", None, said) from error
+            message = f"failed on windows {x.shape}: {type(error).__name__}: {error}"
+            raise InputError(self.place, "", None, message) from error
         expected = (len(x), len(CLASSES))
         if found.shape != expected:
-            said = f"returned the shape {found.shape}; must be {expected}, spikes of each class"
-            raise InputError(self.place, "", None, said)
+            message = f"returned the shape {found.shape}; must be {expected}, spikes of each class"
+            raise InputError(self.place, "", None, message)
         if not ((found >= 0) & (found <= MOST) & (found % 1 == 0)).all():  # NaN is none of these
-            said = f"returned numbers that are no counts of spikes; must be whole, 0 to {MOST}"
-            raise InputError(self.place, "", None, said)
+            message = f"returned numbers that are no counts of spikes; must be whole, 0 to {MOST}"
+            raise InputError(self.place, "", None, message)
         return found.astype(np.int64)
 
 
@@ -136,8 +136,8 @@ def _function(file: Path, name: str, source: bytes) -> Callable[[Any], Any]:
         with redirect_stdout(sys.stderr):
             exec(compile(source, str(file), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
-        said = f"cannot be loaded: {type(error).__name__}: {error}"
-        raise InputError(file, "", None, said) from error
+        message = f"cannot be loaded: {type(error).__name__}: {error}"
+        raise InputError(file, "", None, message) from error
     found = getattr(module, name, None)
     if not callable(found):
         raise InputError(file, "", name, "must be a function in this file")

@@ -1,4 +1,4 @@
-"""Networks of other programs: their function is asked for counts, and its faults are named."""
+"""Networks of other programs: their function returns counts, and its faults are named."""
 
 from __future__ import annotations
 

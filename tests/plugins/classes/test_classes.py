@@ -246,7 +246,7 @@ def test_without_settings_a_network_of_taxels_begins_by_the_data(
     assert (fitted.network.conv1_channels, fitted.windows.channels) == (channels, channels)
     evaluate(store, campaigns)
     found = class_evaluation_of(store)
-    assert found.scores.accuracy.argmax == 1.0  # each object has a taxel of its own
+    assert found.scores.accuracy.argmax == 1.0  # each object has its taxel
 
 
 @pytest.mark.parametrize(
