@@ -17,7 +17,7 @@ from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.rigs.build import build_rig
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ROOT = Path(__file__).parents[1]
 TRIALS = [("pilot", "rehearsal"), ("pilot_gravity", "rehearsal"), ("pilot", "mock")]
@@ -34,7 +34,7 @@ def main(rigs: list[str]) -> None:
                 ROOT / "rigs" / f"{rig_name}.yaml",
                 Path(folder) / "store",
             )
-            campaign = describe_campaign(Store.create(request.store), request)
+            campaign = describe_campaign(TrialStore.create(request.store), request)
             rig = build_rig(request.rig)
             rig.connect()
             collector = TrialCollector(request.plan, request.rig, rig, campaign)

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.adapter import CLASSES, load_adapter
-from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural
+from sliplab.protocols.recorded import RecordedPlan, TrialProperties, natural
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.split import held_out_part
 from sliplab.storage.trials.recording import Recording
@@ -17,8 +17,8 @@ from sliplab.storage.trials.store import (
     IMPORTED,
     Campaign,
     CampaignInfo,
-    Store,
     StoreError,
+    TrialStore,
 )
 
 _NO_PLAN = "was imported without an adapter: it has neither labels nor a split (docs/adapters.md)"
@@ -119,12 +119,12 @@ class Collected:
             return False
         return "nuisances" in text and self.plan.protocol.collection.nuisances is not None
 
-    def describe(self, trial: Trial) -> dict[str, str]:
+    def describe(self, trial: PlannedTrial) -> dict[str, str]:
         """Return a trial's condition as text with units, by factor."""
         return self.planned.describe(trial)
 
     @cached_property
-    def trials(self) -> list[tuple[Trial, Recording]]:
+    def trials(self) -> list[tuple[PlannedTrial, Recording]]:
         """Committed trials of the plan, in the plan's order; the split holds out logged values."""
         there = self.campaign.committed()
         found = [(t, self.campaign.recording(t.id)) for t in self.planned if t.id in there]
@@ -159,17 +159,17 @@ class Collected:
                 return "frames" if counts.events else "events"
         return None
 
-    def of_split(self, split: str) -> Iterator[tuple[Trial, Recording]]:
+    def of_split(self, split: str) -> Iterator[tuple[PlannedTrial, Recording]]:
         """Committed trials of one part of the split."""
         return ((trial, recording) for trial, recording in self.trials if trial.split == split)
 
 
-def _recorded_trial(recording: Recording) -> RecordedTrial:
+def _recorded_trial(recording: Recording) -> TrialProperties:
     record = recording.record
     origin = record.imported
     given = None if origin is None else origin.given
     names = [] if given is None else [span.name for span in given.spans]
-    return RecordedTrial(
+    return TrialProperties(
         record.trial,
         record.condition,
         {} if origin is None else origin.fields,
@@ -180,7 +180,7 @@ def _recorded_trial(recording: Recording) -> RecordedTrial:
     )
 
 
-def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
+def collected(store: TrialStore, names: list[str] | None = None) -> list[Collected]:
     """The campaigns of a store, or those named.
 
     Campaigns with nuisances are left out unless they are named, or another one trains with them.

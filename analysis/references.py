@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from sliplab.analysis.force import sliding_friction
 from sliplab.analysis.quality import hold_rate
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.gates import ReferenceGate
 from sliplab.storage.trials.context import SKIN
 from sliplab.storage.trials.recording import Recording
@@ -57,12 +57,14 @@ def reference_figures(recording: Recording, gate: ReferenceGate) -> dict[str, fl
     return figures
 
 
-def reference_trials(plan: Plan, committed: set[str]) -> list[Trial]:
+def reference_trials(plan: Plan, committed: set[str]) -> list[PlannedTrial]:
     """Return the committed reference trials, in the plan's order."""
     return [trial for trial in plan if trial.role == "reference" and trial.id in committed]
 
 
-def of_skin(campaign: Campaign, trials: Sequence[Trial], skin: str | None) -> list[Trial]:
+def of_skin(
+    campaign: Campaign, trials: Sequence[PlannedTrial], skin: str | None
+) -> list[PlannedTrial]:
     """Return the trials that were taken with a skin; None for that of the last trial."""
     skins = [campaign.recording(trial.id).context.get(SKIN) for trial in trials]
     wanted = skin if skin is not None or not skins else skins[-1]

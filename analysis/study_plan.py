@@ -13,7 +13,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation import holdout as held_out
 from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.protocols import Plan
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 COLLECT_S = {"tracks": 0.3, "video": 5.0}
 """Of a simulated trial, by the camera's source. Likewise:"""
@@ -67,7 +67,7 @@ class Search:
     name: str
     unit: str
     seconds: float
-    run: Callable[[Store, list[Collected]], int]
+    run: Callable[[TrialStore, list[Collected]], int]
 
 
 @dataclass(frozen=True)

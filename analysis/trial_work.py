@@ -8,7 +8,7 @@ from typing import Any
 
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 Make = Callable[[Recording, Any], Any]
 """Compute a result of a trial and settings. It may run in other processes, so it is a function of a
@@ -25,7 +25,7 @@ class TrialWork:
     settings: Any = None
 
 
-def stale_trials(store: Store, step: str, required: list[TrialWork]) -> list[TrialWork]:
+def stale_trials(store: TrialStore, step: str, required: list[TrialWork]) -> list[TrialWork]:
     """Return the `required` results that are missing or have another key."""
     return [
         work

@@ -17,7 +17,7 @@ from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.files import sha256
 from sliplab.storage.trials.catalogue import catalogue, query
 from sliplab.storage.trials.checksums import CHECKSUMS, DATA, FRAMES, RECORD
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 _LINKS = 30_000
 """Names that a file system lets one file have, and then some."""
@@ -27,7 +27,7 @@ WHERE = "depth_mm > 3 and side == 'right' and events > 500"
 def catalogue_figures(records: int, runs: int) -> Figures:
     """Seconds of the first catalogue, which builds the index, and of a query after it."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        store = Store.create(Path(folder) / "store")
+        store = TrialStore.create(Path(folder) / "store")
         fill(store, records)
         began = time.perf_counter()
         whole = catalogue(store)
@@ -42,7 +42,7 @@ def catalogue_figures(records: int, runs: int) -> Figures:
     return {"catalogue_build_s": built, **spread("catalogue_100k_s", taken)}
 
 
-def fill(store: Store, records: int) -> None:
+def fill(store: TrialStore, records: int) -> None:
     """Commit so many trials to a campaign of their own."""
     campaign = store.campaign("many")
     campaign.update({"name": "many", "simulated": True}, "protocol: 1\n", "rig: 1\n")

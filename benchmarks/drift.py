@@ -27,7 +27,7 @@ from sliplab.protocols import load_plan
 from sliplab.protocols.shipped import shipped_protocols
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SPREAD, SPECIMENS, ZERO_MM = 0.5, 0.2, 0.05
 FALL = 0.9
@@ -44,7 +44,7 @@ def main() -> None:
     asked = parser.parse_args()
     with_forces = not asked.without_forces
     folder: Path = asked.folder
-    store = Store(folder) if folder.exists() else Store.create(folder)
+    store = TrialStore(folder) if folder.exists() else TrialStore.create(folder)
     data = yaml.safe_load(shipped_protocols()["pilot"].read_text())
     data["collection"]["references"] = {"every": 4, "condition": CONDITION}
     protocol = folder / "references.yaml"

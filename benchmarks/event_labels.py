@@ -28,7 +28,7 @@ from sliplab.protocols.shipped import shipped_protocols
 from sliplab.storage.schema.label import KINDS
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ROOT = Path(__file__).parents[1]
 F64 = npt.NDArray[np.float64]
@@ -249,7 +249,7 @@ def take(
     request = make_request(shipped_protocols()[protocol], path, folder / "store")
     chosen = sample_trials(request.plan, trials)
     collect(replace(request, only=frozenset(trial.id for trial in chosen)))
-    campaign = Store.open(folder / "store").campaign(request.campaign)
+    campaign = TrialStore.open(folder / "store").campaign(request.campaign)
     return list(campaign.recordings())
 
 

@@ -133,9 +133,9 @@ def _peak(what: str, form: str, folder: Path) -> float:
 
 def run(what: str, form: str, folder: Path) -> None:
     """Import the data of a folder into the store next to it, or export that."""
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    store = Store(folder / "store")
+    store = TrialStore(folder / "store")
     if what == "export":
         from sliplab.storage.formats.export_trials import export_trials
 

@@ -48,7 +48,7 @@ from sliplab.protocols import Plan
 from sliplab.protocols.claims import FIGURES
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plan import load_plan
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 TABLE = ROOT / "benchmarks/results/trial_figures.csv"
 BATCHES = {"kinematic": BATCH, "gravity": 8}
@@ -76,7 +76,7 @@ CLAIMS: dict[str, tuple[str, dict[str, Any]]] = {
 def write_figures(store: Path, model: Path) -> None:
     """Write a row for every trial of a store."""
     rows = []
-    for item in collected(Store.open(store)):
+    for item in collected(TrialStore.open(store)):
         for trial, recording in item.trials:
             if trial.role != "measured":
                 continue

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from sliplab.plugins.simulation.scene_runs import changed, ideal
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
@@ -75,7 +75,7 @@ CANDIDATES = (
 )
 
 
-def run(rig: RigFile, plan: Plan, trial: Trial) -> Json:
+def run(rig: RigFile, plan: Plan, trial: PlannedTrial) -> Json:
     """Run a trial as a campaign's first attempt; the simulation's truth."""
     built = build_rig(rig)
     built.connect()

@@ -32,7 +32,7 @@ from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, brid
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.plugins.simulation.scene_runs import MOTION, changed, with_true_times
 from sliplab.plugins.simulation.settings import scene_of
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.labelling import Labelling
 from sliplab.protocols.plan import load_plan
@@ -86,7 +86,7 @@ class _Eye:
                 self.poses.append(self._plate.update(image))
 
 
-def check(job: tuple[RigFile, Plan, Trial, dict[str, Any], bool]) -> Checked:
+def check(job: tuple[RigFile, Plan, PlannedTrial, dict[str, Any], bool]) -> Checked:
     """Simulate, track and label one trial, and hold it against the truth."""
     rig, plan, trial, camera, stressed = job
     draw = np.random.default_rng(hash_integer(trial.seed, "labels truth", SEED) % 2**63)
@@ -139,7 +139,7 @@ _TRACKS = {"level": "tracks", "centroid_noise_px": 0.0, "plate_noise_px": 0.0}
 
 
 def _run(
-    rig: RigFile, plan: Plan, trial: Trial, jitter: np.random.Generator | None
+    rig: RigFile, plan: Plan, trial: PlannedTrial, jitter: np.random.Generator | None
 ) -> tuple[_Eye, Json, int]:
     """Frames as seen, the truth, and the start of the motion on the cameras' (true) clock."""
     layout = np.array(rig.skin.layout_mm()) * rig.frame_camera.scale_px_per_mm * [1.0, -1.0]
@@ -224,7 +224,7 @@ def run_checks(slides: int, falls: int, stressed: int) -> tuple[list[Checked], .
     kinematic, gravity = (
         load_plan(ROOT / "protocols" / f"{name}.yaml") for name in ("kinematic", "gravity")
     )
-    sets: list[list[tuple[RigFile, Plan, Trial, dict[str, Any], bool]]] = [
+    sets: list[list[tuple[RigFile, Plan, PlannedTrial, dict[str, Any], bool]]] = [
         [(rig, kinematic, trial, NUISANCES, False) for trial in sample_trials(kinematic, slides)],
         [(rig, gravity, trial, NUISANCES, False) for trial in sample_trials(gravity, falls)],
         [(rig, kinematic, trial, GLARE, True) for trial in sample_trials(kinematic, stressed)],

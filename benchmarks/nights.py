@@ -36,7 +36,7 @@ from sliplab.flows.log import log_entries
 from sliplab.storage.files import read_json
 from sliplab.storage.process import Child
 from sliplab.storage.trials.checksums import RECORD
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SAMPLE_S = 30.0
 LIMIT_S = 180.0
@@ -341,7 +341,7 @@ def account(
     folder: Path, plan: list[Window], receiver: Receiver, done: list[tuple[str, str]]
 ) -> list[str]:
     """Return what is missing or too much among alerts, log and trials."""
-    store, faults = Store.open(folder / "store"), []
+    store, faults = TrialStore.open(folder / "store"), []
     campaigns = {item.name: item for item in store.campaigns()}
     failed = sum(
         str(e["cause"]).startswith("gate") for c in campaigns.values() for e in c.quarantined()

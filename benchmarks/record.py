@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.measure import SEED, Figures, resident_mb
 from sliplab.plugins.record.recorder import RecordedTrial, record
 from sliplab.plugins.record.sources import push
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify_trial
 from tests.plugins.record.lsl_clocks import recordings
 
@@ -123,7 +123,7 @@ def _load(folder: Path, seconds: float) -> Figures:
             end.set()
             thread.join()
         lost = sum(trial.lost().values())
-    campaign = Store.open(folder).campaign("load")
+    campaign = TrialStore.open(folder).campaign("load")
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     found = campaign.recording(trial.id)
     stored = {name: each.rows for name, each in found.record.streams.items()}

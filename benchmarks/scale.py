@@ -29,7 +29,7 @@ from sliplab.storage.remote.manifest import trial_manifest
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ROOT = Path(__file__).parent.parent
 
@@ -46,7 +46,7 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
         with open_session(rig, trials) as taking:
             taking.take()
             campaign = taking.collector.campaign
-            store = Store.open(campaign.folder.parent.parent)
+            store = TrialStore.open(campaign.folder.parent.parent)
             found = list(campaign.recordings())
             each = len(found)
             sizes = [trial_manifest(campaign, item.trial_id).files for item in found]
@@ -86,7 +86,7 @@ def _count(fitted: training.Fitted, windows: list[npt.NDArray[np.uint8]]) -> Non
         training.predict_counts(fitted, x)
 
 
-def _pushing(store: Store, runs: int, s3: bool) -> Figures:
+def _pushing(store: TrialStore, runs: int, s3: bool) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         places = {"folder": lambda: f"file://{folder}/{uuid4().hex}"}
         figures = _rates(store, runs, places)
@@ -101,7 +101,7 @@ def _pushing(store: Store, runs: int, s3: bool) -> Figures:
     return figures
 
 
-def _rates(store: Store, runs: int, places: dict[str, Callable[[], str]]) -> Figures:
+def _rates(store: TrialStore, runs: int, places: dict[str, Callable[[], str]]) -> Figures:
     figures: Figures = {}
     for name, new in places.items():
         sent: list[int] = []

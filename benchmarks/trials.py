@@ -20,9 +20,9 @@ from benchmarks.measure import SEED, peak_mb
 from sliplab.flows.collecting.live_feed import LiveFeed
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.run_request import describe_campaign, make_request
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.rigs.build import build_rig
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ROOT = Path(__file__).parent.parent
 
@@ -32,7 +32,7 @@ class SimulatedSession:
     """Session at a simulated rig with its store, ready to take trials."""
 
     collector: TrialCollector
-    trials: list[Trial]
+    trials: list[PlannedTrial]
     feed: LiveFeed
 
     def take(self, count: int | None = None) -> float:
@@ -56,7 +56,7 @@ def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[
         file = Path(folder) / f"{protocol}.yaml"
         file.write_text(yaml.safe_dump(text, sort_keys=False), "utf-8")
         run_request = make_request(file, ROOT / "rigs" / f"{rig}.yaml", Path(folder) / "store")
-        store = Store.create(run_request.store)
+        store = TrialStore.create(run_request.store)
         campaign = describe_campaign(store, run_request)
         device = build_rig(run_request.rig)
         device.connect()

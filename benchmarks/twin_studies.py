@@ -63,7 +63,7 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -216,7 +216,7 @@ def calibrated(asked: argparse.Namespace, folder: Path, hidden: Path) -> Path:
 class TrainedStudy:
     """Labelled trials of a study, and the networks that it trained."""
 
-    store: Store
+    store: TrialStore
     campaigns: list[Collected]
     networks: list[Fitted]
 

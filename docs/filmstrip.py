@@ -20,7 +20,7 @@ import numpy as np
 
 from sliplab.plugins.simulation.devices import MockDevices, build_mock
 from sliplab.plugins.simulation.rig import simulated_rig
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.physics_levels import with_level
 from sliplab.rigs.rig_file import load_rig_file
@@ -50,7 +50,7 @@ class Film(NullSink):
             self.image_ns.append(int(chunk.t_ns[index]))
 
 
-def take(plan: Plan, trial: Trial) -> tuple[MockDevices, Film, dict[str, Any]]:
+def take(plan: Plan, trial: PlannedTrial) -> tuple[MockDevices, Film, dict[str, Any]]:
     """One trial on the default rig."""
     file, _ = load_rig_file(ROOT / "rigs" / "mock.yaml")
     file = with_level(file, plan)

@@ -18,7 +18,8 @@ _PROGRAM = __name__ == "__main__" or sys.argv[0].endswith("/sliplab")
 # it imports the program of its parent, with the same arguments
 _WORKER = "--multiprocessing-fork" in sys.orig_argv
 if _PROGRAM and not _WORKER and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # no traceback from a module that is just imported
+    # no traceback from a module that is just imported; the code is `exit_codes.INTERRUPTED`,
+    # which is not imported yet
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 from sliplab.flows.running import exit_codes  # noqa: E402

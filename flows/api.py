@@ -31,8 +31,7 @@ from sliplab.protocols import InputError, load_plan
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.streams import EventChunk, Json
-from sliplab.storage.trials.store import STORE
-from sliplab.storage.trials.store import Store as TrialStore
+from sliplab.storage.trials.store import STORE, TrialStore
 
 if TYPE_CHECKING:
     import pandas as pd

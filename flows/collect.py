@@ -1,7 +1,8 @@
 """Collection of the missing trials of one protocol on one rig.
 
 The store is the only record of progress. Prefect sees one flow per campaign and one task per batch
-of trials: one trial on a real rig, many on a mock rig, where a task costs as much as a trial.
+of trials, which ends after 5 s or 25 trials: one trial on a real rig, as a rule, and many on a
+simulated one, where a task costs as much as a trial.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from sliplab.flows.planning.run_request import CampaignCounts, RunRequest, check
 from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.storage.trials import control
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 BATCH = 25
 """Most trials in a task."""
@@ -45,7 +46,7 @@ class CollectResult(CampaignCounts):
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
-def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[Trial]]) -> int:
+def take_trials(collector: Opaque[TrialCollector], trials: Opaque[list[PlannedTrial]]) -> int:
     """Collect trials in order, at most `BATCH` and for `BATCH_S`; return their number."""
     began, count = time.monotonic(), 0
     for trial in trials.content[:BATCH]:
@@ -63,7 +64,7 @@ def collect_flow(request: RunRequest) -> CollectResult:
     with (
         progress_display(request) as progress,
         open_session(request, progress) as session,
-        timed(Store(request.store), f"collect {request.campaign}"),
+        timed(TrialStore(request.store), f"collect {request.campaign}"),
     ):
         collector, trials = session.collector, session.trials
         # inside a flow Prefect has installed its own handlers
@@ -99,7 +100,7 @@ def collect(run_request: RunRequest) -> CollectResult:
         CampaignStopped: the store is paused, the disk has no room for the next trial, or
             reference trials drifted apart.
     """
-    store = Store.create(run_request.store)
+    store = TrialStore.create(run_request.store)
     refuse_paused(store)
     if control.open_requests(store):  # the requester was killed before it carried them out
         with store_lock(store):

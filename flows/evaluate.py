@@ -26,7 +26,7 @@ from sliplab.flows.train import sample_maker
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -59,7 +59,7 @@ class EvaluateDone(StepResult):
 
 
 def evaluate(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,

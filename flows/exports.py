@@ -20,7 +20,7 @@ from sliplab.protocols.shown import one_of
 from sliplab.storage.errors import StoreError
 
 if TYPE_CHECKING:
-    from sliplab.storage.trials.store import Campaign, Store
+    from sliplab.storage.trials.store import Campaign, TrialStore
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def export(request: ExportRequest) -> ExportResult:
     return form.write(request)
 
 
-def _chosen(request: ExportRequest) -> tuple[Store, Campaign, list[str]]:
+def _chosen(request: ExportRequest) -> tuple[TrialStore, Campaign, list[str]]:
     """Return a store, a campaign of it, and the requested trials."""
     from sliplab.storage.remote.mirror import open_store
 

@@ -25,7 +25,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import MIXED, recordings_in, skipped_in, trials_of
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SETTLED_S = 5.0
 """Time without a change after which a file may be closed; recorders flush about once a second."""
@@ -102,7 +102,7 @@ class FolderWatch:
         trials = trials_of(self.path, ready, salvage=self.salvage)
         if self.simulated:
             trials = (replace(trial, simulated=True) for trial in trials)
-        store = Store.create(self.store)
+        store = TrialStore.create(self.store)
         try:
             with store_lock(store):
                 result = import_trials(

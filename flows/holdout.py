@@ -20,7 +20,7 @@ from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
 from sliplab.flows.steps import StepDone
 from sliplab.storage.schema.holdout import HoldoutResult
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
 """Seeds of trials and of the skin. They must not be used anywhere else: not in a protocol, a rig, a
@@ -35,7 +35,7 @@ class HeldOut(StepDone):
 
 
 def measure_holdout(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     trials: int,
     again: bool = False,

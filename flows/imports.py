@@ -18,7 +18,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import format_names
 from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store, StoreError, refuse_url
+from sliplab.storage.trials.store import StoreError, TrialStore, refuse_url
 
 
 def import_data(
@@ -99,11 +99,11 @@ def say_faults(result: Json) -> None:
 
 
 @contextmanager
-def new_store(place: Path) -> Iterator[Store]:
+def new_store(place: Path) -> Iterator[TrialStore]:
     """Yield the store at `place`; one that is made here is removed again if it stays empty."""
     there = place.is_dir() and any(place.iterdir())
     existed = place.exists()
-    store = Store.create(place)
+    store = TrialStore.create(place)
     try:
         yield store
     except BaseException:

@@ -19,7 +19,7 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import StepResult
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.evaluation import AlarmRate
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -49,7 +49,7 @@ class JudgedDetector(StepResult):
 
 
 def judge_detector(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     model: Path,
     cluster: Cluster | None = None,

@@ -27,7 +27,7 @@ from sliplab.storage.schema.evaluation import (
     Share,
 )
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
 
-def spike_keeper(store: Store, cluster: Cluster | None) -> KeepTrials:
+def spike_keeper(store: TrialStore, cluster: Cluster | None) -> KeepTrials:
     """Return a function that counts and stores spikes: in this process, where it uses all cores,
     or on a cluster."""
 
@@ -68,7 +68,7 @@ class NetworkScores(StepResult):
 
 
 def judge_model(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     model: Path,
     engine: Engines | None = None,
@@ -95,7 +95,7 @@ def judge_model(
 
 
 def judge_predictions(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     predictions: Path | pd.DataFrame,
     margin: float | None = None,

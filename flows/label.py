@@ -27,7 +27,7 @@ from sliplab.storage.files import write_text
 from sliplab.storage.schema.evaluation import LabelCheck
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.planning.run_request import RunRequest
@@ -47,7 +47,9 @@ def _required_labels(campaigns: list[Collected]) -> list[TrialWork]:
     ]
 
 
-def label(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> StepResult:
+def label(
+    store: TrialStore, campaigns: list[Collected], cluster: Cluster | None = None
+) -> StepResult:
     """Label every trial of `campaigns` that needs it.
 
     Trials without frames are labelled by their events.
@@ -97,11 +99,11 @@ def video_request(run_request: RunRequest, trials: int) -> RunRequest:
     data.setdefault("mock", {}).setdefault("frame_camera", {})["level"] = "video"
     rig = folder.with_suffix(".yaml")
     write_text(rig, rig_yaml(data))
-    protocol = Store.open(run_request.store).campaign(run_request.campaign).protocol_file
+    protocol = TrialStore.open(run_request.store).campaign(run_request.campaign).protocol_file
     request = make_request(protocol, rig, folder, campaign=run_request.campaign, claims="ignore")
     there = 0
     if (folder / "store.json").exists():
-        there = len(Store.open(folder).campaign(run_request.campaign).committed())
+        there = len(TrialStore.open(folder).campaign(run_request.campaign).committed())
     return replace(request, most=max(trials - there, 0))
 
 
@@ -116,12 +118,12 @@ def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> StepR
 
     video = video_request(run_request, trials)
     taken = collect(video)["taken"] if video.most else 0
-    store = Store.open(check_folder(run_request))
+    store = TrialStore.open(check_folder(run_request))
     campaigns = collected(store, [video.campaign])
     label(store, campaigns)
     made_of = [recording.checksum for _, recording in campaigns[0].trials]
     key = make_key(CHECK, CHECK_VERSION, [made_of, labelling.VERSION], None)
-    stored = Derived.of(Store.open(run_request.store), CHECK)
+    stored = Derived.of(TrialStore.open(run_request.store), CHECK)
     stale = not stored.fresh(CHECK, key)
     if stale:
         figures = rules_compared(store, campaigns)

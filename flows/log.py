@@ -29,7 +29,7 @@ from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.context import check_values, log_journal, planned_names
 from sliplab.storage.trials.journal import signature
 from sliplab.storage.trials.registration import registrations
-from sliplab.storage.trials.store import AGAIN, CAUSE, IMPORTED, Campaign, Store
+from sliplab.storage.trials.store import AGAIN, CAUSE, IMPORTED, Campaign, TrialStore
 
 MOST_CHARACTERS = 10_000
 """Length of a note."""
@@ -58,7 +58,7 @@ class LogEntry:
 
 
 def add_note(
-    store: Store,
+    store: TrialStore,
     text: str = "",
     *,
     who: str = "",
@@ -103,7 +103,7 @@ def add_note(
     return _entry(entry)
 
 
-def _begun(store: Store, names: Sequence[str] | None) -> list[Campaign]:
+def _begun(store: TrialStore, names: Sequence[str] | None) -> list[Campaign]:
     """Return the campaigns that a change is about."""
     there = {item.name: item for item in store.campaigns() if IMPORTED not in item.info}
     for name in names or ():
@@ -164,7 +164,7 @@ def _entry(data: Json) -> LogEntry:
     )
 
 
-def log_entries(store: Store, unreadable: list[str] | None = None) -> list[LogEntry]:
+def log_entries(store: TrialStore, unreadable: list[str] | None = None) -> list[LogEntry]:
     """Return the log, oldest first.
 
     Args:
@@ -180,7 +180,7 @@ def log_entries(store: Store, unreadable: list[str] | None = None) -> list[LogEn
     return sorted(found, key=lambda entry: (entry.when, entry.campaign, entry.what, entry.trials))
 
 
-def _notes(store: Store, faults: list[str]) -> Iterator[LogEntry]:
+def _notes(store: TrialStore, faults: list[str]) -> Iterator[LogEntry]:
     journal = log_journal(store)
     for number in journal.numbers():
         data = _read(journal.path(number), "when", faults)
@@ -188,7 +188,7 @@ def _notes(store: Store, faults: list[str]) -> Iterator[LogEntry]:
             yield _entry(data)
 
 
-def _requests(store: Store) -> Iterator[LogEntry]:
+def _requests(store: TrialStore) -> Iterator[LogEntry]:
     for request in control.requests(store):
         answer = control.answered(store, request)
         text = request.why if answer is not None else f"{request.why} (not carried out yet)".strip()
@@ -202,7 +202,7 @@ def _requests(store: Store) -> Iterator[LogEntry]:
         )
 
 
-def _runs(store: Store) -> Iterator[LogEntry]:
+def _runs(store: TrialStore) -> Iterator[LogEntry]:
     for run, ended in run_records.runs(store.folder):
         name = " of ".join(filter(None, [run["flow"], run.get("deployment", "")]))
         if ended is None:
@@ -281,7 +281,7 @@ def _registered(campaign: Campaign, faults: list[str]) -> Iterator[LogEntry]:
         )
 
 
-def _decisions(store: Store, campaign: Campaign, faults: list[str]) -> Iterator[LogEntry]:
+def _decisions(store: TrialStore, campaign: Campaign, faults: list[str]) -> Iterator[LogEntry]:
     for trial in sorted(review.counts(store, campaign.name)):
         try:
             history = review.history(store, campaign.name, trial)

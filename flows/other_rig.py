@@ -13,7 +13,7 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import make_folder, write_text
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def other_request(
@@ -63,9 +63,9 @@ def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
             data[name] = value
 
 
-def retake(run_requests: Sequence[RunRequest]) -> tuple[Store, list[Collected]]:
+def retake(run_requests: Sequence[RunRequest]) -> tuple[TrialStore, list[Collected]]:
     """Take the missing trials and label them; return the store and its campaigns."""
-    store = Store.create(run_requests[0].store)
+    store = TrialStore.create(run_requests[0].store)
     for run_request in run_requests:
         collect(run_request)
     campaigns = collected(store, [run_request.campaign for run_request in run_requests])

@@ -23,7 +23,7 @@ from sliplab.protocols import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, read_json, write_json, write_text
 from sliplab.storage.trials.checksums import PROVENANCE
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 PROGRAM = {"session", "run", "quarantine"}
 """Entries of the log that programs made: they are counted, not listed."""
@@ -109,7 +109,7 @@ def _midnight(day: date) -> datetime:
     return datetime.combine(day, time()).astimezone()
 
 
-def write_period_report(store: Store, since: datetime, until: datetime, now: datetime) -> Path:
+def write_period_report(store: TrialStore, since: datetime, until: datetime, now: datetime) -> Path:
     """Write the report as a page and as JSON; return the page.
 
     Raises:
@@ -126,7 +126,9 @@ def write_period_report(store: Store, since: datetime, until: datetime, now: dat
     return page
 
 
-def period_report(store: Store, since: datetime, until: datetime, now: datetime) -> PeriodReport:
+def period_report(
+    store: TrialStore, since: datetime, until: datetime, now: datetime
+) -> PeriodReport:
     """Collect what happened in a period, from `since` until before `until`."""
     status = StatusReader(store).read(now)
     unreadable: list[str] = []

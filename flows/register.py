@@ -18,7 +18,7 @@ from sliplab.storage.files import sha256
 from sliplab.storage.process import now
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.registration import add_registration, registrations
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.versions import FIGURES, RECORDING, installed_versions
 
 
@@ -65,7 +65,7 @@ def register(
         "rig": None if rig is None else _rig(rig, plan),
         "versions": installed_versions((*RECORDING, *FIGURES)),
     }
-    opened = Store.create(store)
+    opened = TrialStore.create(store)
     found = opened.campaign(campaign or plan.name)
     with store_lock(opened):
         if found.begun and found.info.get("collection_hash") != plan.collection_hash:

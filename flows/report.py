@@ -17,7 +17,7 @@ from sliplab.analysis.report import against as comparison
 from sliplab.analysis.report import scores
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.sources import STEP, report_folder
-from sliplab.flows.planning.estimate import plan_bytes
+from sliplab.flows.planning.size_estimate import plan_bytes
 from sliplab.flows.running.orchestration import run
 from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.steps import StepResult
@@ -27,12 +27,12 @@ from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.catalogue import write_table
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SUMMARY = "summary.json"
 
 
-def report(store: Store, campaigns: list[Collected]) -> StepResult:
+def report(store: TrialStore, campaigns: list[Collected]) -> StepResult:
     """Write the report if anything it shows has changed.
 
     Raises:
@@ -81,7 +81,7 @@ def _planned_bytes(item: Collected) -> int:
     return round(plan_bytes(rig, item.plan, {trial.id for trial in item.plan} - done))
 
 
-def against(store: Store, other: Path) -> tuple[comparison.ReportComparison, Path]:
+def against(store: TrialStore, other: Path) -> tuple[comparison.ReportComparison, Path]:
     """Compare the last report with another one, and write a page about it.
 
     Args:
@@ -97,12 +97,12 @@ def against(store: Store, other: Path) -> tuple[comparison.ReportComparison, Pat
     return compared, path
 
 
-def read_one_camera(store: Store) -> OneCameraSummary | None:
+def read_one_camera(store: TrialStore) -> OneCameraSummary | None:
     """Read the numbers of the last report where it is on a rig with one camera; else None."""
     path = report_folder(store) / SUMMARY
     return OneCameraSummary.load(path) if "one_camera" in read_json(path) else None
 
 
-def read_summary(store: Store) -> Summary:
+def read_summary(store: TrialStore) -> Summary:
     """Read the numbers of the last report."""
     return Summary.load(report_folder(store) / SUMMARY)

@@ -14,7 +14,7 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.context import ContextChange
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RepeatItem:
 
 
 def to_repeat(
-    store: Store,
+    store: TrialStore,
     campaign: Campaign,
     plan: Plan,
     change: ContextChange,
@@ -62,7 +62,7 @@ def to_repeat(
 
 
 def _at_the_rig(
-    store: Store, rig: RigFile, plan: Plan, skin: str, since: datetime, *, begun: bool
+    store: TrialStore, rig: RigFile, plan: Plan, skin: str, since: datetime, *, begun: bool
 ) -> Iterator[RepeatItem]:
     if rig.skin.serial != skin and not rig.simulated:
         yield RepeatItem(f"rig file: skin.serial: {skin}, and skin.made")
@@ -89,7 +89,7 @@ def _references(plan: Plan, new: set[str]) -> Iterator[RepeatItem]:
 
 
 def _results(
-    store: Store, campaign: Campaign, since: datetime, new: set[str]
+    store: TrialStore, campaign: Campaign, since: datetime, new: set[str]
 ) -> Iterator[RepeatItem]:
     labels = Derived.of(store, LABELS, campaign.name)
     if missing := sum(labels.key(trial) is None for trial in new):
@@ -102,5 +102,5 @@ def _results(
         )
 
 
-def _models(store: Store) -> list[Path]:
+def _models(store: TrialStore) -> list[Path]:
     return sorted((store.folder / "models").glob("*.pt"))

@@ -30,7 +30,7 @@ from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE, Checksums, incomplete, read_sums
 from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
 from sliplab.storage.trials.lock import STORE_LOCK, current_holder
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store
+from sliplab.storage.trials.store import IMPORTED, Campaign, TrialStore
 
 LOOK_BACK = 50
 """Committed trials from which pace and size are estimated."""
@@ -161,7 +161,7 @@ class _TrialFolder:
 class StatusReader:
     """Reads the state of a store again and again; what cannot change is read once."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: TrialStore) -> None:
         self._store = store
         self._known: dict[tuple[Path, int], _TrialFolder] = {}
         self._drift: dict[tuple[str, ...], list[DriftStatus]] = {}

@@ -68,9 +68,9 @@ def located(place: str) -> Path:
 def prepare_store(folder: Path) -> None:
     """Make the store and point Prefect at it; everything that imports Prefect comes after."""
     from sliplab.flows.running import orchestration
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    orchestration.configure_prefect(Store.create(folder).folder)
+    orchestration.configure_prefect(TrialStore.create(folder).folder)
 
 
 def run_step(

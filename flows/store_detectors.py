@@ -26,7 +26,7 @@ from sliplab.flows.detecting.sources import NamedSource, named_source
 from sliplab.flows.judge_network import spike_keeper
 from sliplab.protocols import InputError
 from sliplab.protocols.shown import one_of
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 OWN = "own"
 """Title of the store's own network."""
@@ -49,7 +49,7 @@ class NetworkDetectors:
 
 
 def store_detectors(
-    store: Store, campaigns: list[Collected], promise: float | None = None
+    store: TrialStore, campaigns: list[Collected], promise: float | None = None
 ) -> Iterator[NetworkDetectors]:
     """Yield the store's own network with every detector, then the networks that `also` names.
 
@@ -86,7 +86,7 @@ def store_detectors(
         yield NetworkDetectors(f"preset: {theirs.preset}", other, with_rule)
 
 
-def _others(store: Store, campaigns: list[Collected]) -> Iterator[ModelOnDisk]:
+def _others(store: TrialStore, campaigns: list[Collected]) -> Iterator[ModelOnDisk]:
     """Yield the networks that `also` names. Raises StoreError if one is missing or stale."""
     for other in comparison_models(store, campaigns):
         if not other.fresh:
@@ -156,7 +156,7 @@ def _of_store(place: Path, names: Sequence[str], promise: float | None) -> dict[
             return {}
         right = "has no models/*.pt: train it first, or name a model file"
         raise InputError("MODEL", "", place, right)
-    store = Store(place)
+    store = TrialStore(place)
     campaigns = collected(store, None)
     found = {NETWORK: Chosen(choose_model(wanted_models(store, campaigns)).path)}
     for other in _others(store, campaigns):

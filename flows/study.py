@@ -35,7 +35,7 @@ from sliplab.flows.window_checks import window_baselines
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import import_foreign
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 BASELINE_S = 0.0105
 """Time of all ordinary networks and trees, per training window, s."""
@@ -60,7 +60,7 @@ def study(
         more: searches before the report.
         holdout: trials of the campaign that chooses nothing, where slides are simulated.
     """
-    store = Store.create(run_requests[0].store)
+    store = TrialStore.create(run_requests[0].store)
     planned = study_plan(run_requests)
     one_camera = len(run_requests[0].rig.cameras) == 1
     check = check if check_required(run_requests[0]) and not one_camera else 0
@@ -97,7 +97,7 @@ def study(
     return StudyOutcome(taken, steps, ledger.rows())
 
 
-def _search(search: Search, store: Store, campaigns: list[Collected]) -> StepDone:
+def _search(search: Search, store: TrialStore, campaigns: list[Collected]) -> StepDone:
     return {"step": search.name, "done": search.run(store, campaigns)}
 
 

@@ -29,7 +29,7 @@ from sliplab.flows.steps import StepResult
 from sliplab.protocols.shown import plural
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import SYNC, Store, StoreError
+from sliplab.storage.trials.store import SYNC, StoreError, TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -61,7 +61,7 @@ class SyncDone(StepResult):
     campaigns: dict[str, CampaignClocks]
 
 
-def sync(store: Store, campaigns: list[Collected], cluster: Cluster | None = None) -> SyncDone:
+def sync(store: TrialStore, campaigns: list[Collected], cluster: Cluster | None = None) -> SyncDone:
     """Fit stale clocks, and write the page if anything on it has changed.
 
     Raises:
@@ -101,7 +101,7 @@ def sync(store: Store, campaigns: list[Collected], cluster: Cluster | None = Non
 
 
 def _write_page(
-    store: Store,
+    store: TrialStore,
     campaigns: Sequence[Collected],
     required: Sequence[TrialWork],
     trials: Mapping[str, Sequence[TrialClocks]],

@@ -25,7 +25,7 @@ from sliplab.flows.running.parallel_map import each_trial
 from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
 from sliplab.flows.ui.train_view import training_progress
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -60,7 +60,7 @@ def train_flow(problem: Problem, models: list[ModelOnDisk], cluster: Cluster | N
 
 
 def train(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     cluster: Cluster | None = None,
     reviewed: bool = False,
@@ -101,7 +101,7 @@ def _warn_of_missing(classes: tuple[str, ...], train: Any) -> None:
         )
 
 
-def sample_maker(store: Store, split: str, cluster: Cluster | None) -> EachTrial:
+def sample_maker(store: TrialStore, split: str, cluster: Cluster | None) -> EachTrial:
     """Return what makes the samples of a split: this process, or a cluster's workers."""
     if cluster is None:
         return in_order

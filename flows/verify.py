@@ -12,7 +12,7 @@ from sliplab.protocols.plugin import plugins
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.prefix_journal import JOURNAL
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import (
     DAMAGED,
     StoreProblem,
@@ -67,7 +67,7 @@ def verify(place: str, quarantine: bool = False) -> Verification:
 
     if is_url(place):
         return _verify_pushed(place, quarantine)
-    opened = Store.open(Path(place))
+    opened = TrialStore.open(Path(place))
     _salvage(opened)
     total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     mended: list[Path] = []
@@ -104,7 +104,7 @@ def verify(place: str, quarantine: bool = False) -> Verification:
     return result
 
 
-def _salvage(store: Store) -> None:
+def _salvage(store: TrialStore) -> None:
     """Let plug-ins keep what verifies of trials whose program was killed, if none other writes."""
     folders = (path for each in store.campaigns() for path in each.folders("incoming"))
     if not any((path / JOURNAL).exists() for path in folders):

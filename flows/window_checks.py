@@ -31,7 +31,7 @@ from sliplab.flows.running.run_records import timed
 from sliplab.flows.steps import StepResult
 from sliplab.storage.schema.evaluation import BaselineResult
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 SPLITS = ("train", "validation", "test")
 CHECKED_EPOCHS = 3
@@ -58,7 +58,7 @@ class ChecksDone(StepResult):
 
 
 def window_baselines(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
+    store: TrialStore, campaigns: list[Collected], reviewed: bool = False
 ) -> BaselinesDone:
     """Train and keep every baseline that is missing or stale.
 
@@ -94,7 +94,9 @@ def window_baselines(
     }
 
 
-def window_checks(store: Store, campaigns: list[Collected], reviewed: bool = False) -> ChecksDone:
+def window_checks(
+    store: TrialStore, campaigns: list[Collected], reviewed: bool = False
+) -> ChecksDone:
     """Check permuted classes, shuffled labels, and that no trial is in two parts of the split.
 
     Raises:

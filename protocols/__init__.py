@@ -2,7 +2,7 @@
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
-from sliplab.protocols.plan import Plan, Task, Trial, load_plan, make_plan
+from sliplab.protocols.plan import Plan, PlannedTrial, Task, load_plan, make_plan
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step, Twist
 
 __all__ = [
@@ -10,13 +10,13 @@ __all__ = [
     "InputError",
     "Move",
     "Plan",
+    "PlannedTrial",
     "PlateStep",
     "Position",
     "Program",
     "Protocol",
     "Step",
     "Task",
-    "Trial",
     "Twist",
     "load_plan",
     "make_plan",

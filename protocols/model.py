@@ -25,10 +25,10 @@ from sliplab.protocols.factors import (
 )
 from sliplab.protocols.gates import Gates
 from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
-from sliplab.protocols.limits import ProtocolLimits
 from sliplab.protocols.maintenance import Maintenance, ReferenceSettings
 from sliplab.protocols.nuisances import Nuisances
 from sliplab.protocols.phases import Phase
+from sliplab.protocols.protocol_limits import ProtocolLimits
 from sliplab.protocols.quantity import FactorRef, KilogramsOrRef
 from sliplab.protocols.recording import RecordingSettings
 from sliplab.protocols.settings import AnalysisSettings

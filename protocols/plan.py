@@ -43,7 +43,7 @@ MAX_ID = 240
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlannedTrial:
     """One planned trial."""
 
     index: int
@@ -104,7 +104,7 @@ class Plan:
     protocol: Protocol
     file: str
     enabled: Mapping[str, tuple[Level, ...]]
-    trials: tuple[Trial, ...]
+    trials: tuple[PlannedTrial, ...]
     _programs: dict[tuple[tuple[str, Level], ...], Program] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -137,10 +137,10 @@ class Plan:
     def __len__(self) -> int:
         return len(self.trials)
 
-    def __iter__(self) -> Iterator[Trial]:
+    def __iter__(self) -> Iterator[PlannedTrial]:
         return iter(self.trials)
 
-    def program(self, trial: Trial) -> Program:
+    def program(self, trial: PlannedTrial) -> Program:
         """The motion program of `trial`."""
         if trial.condition not in self._programs:
             self._programs[trial.condition] = build_program(
@@ -148,7 +148,7 @@ class Plan:
             )
         return self._programs[trial.condition]
 
-    def seconds(self, trial: Trial, *, recorded_only: bool = False) -> float:
+    def seconds(self, trial: PlannedTrial, *, recorded_only: bool = False) -> float:
         """Planned seconds of motion of one trial."""
         key = trial.condition, recorded_only
         if key not in self._seconds:  # the live page asks for all trials every few seconds
@@ -160,7 +160,7 @@ class Plan:
         """Planned seconds of motion of all trials, maintenance and people's work left out."""
         return sum(self.seconds(trial) for trial in self.trials)
 
-    def describe(self, trial: Trial) -> dict[str, str]:
+    def describe(self, trial: PlannedTrial) -> dict[str, str]:
         """The trial's condition as text with units, by factor."""
         factors = self.protocol.collection.all_factors
         return {name: factors[name].text(level) for name, level in trial.condition}
@@ -188,7 +188,7 @@ class Plan:
         factor = self.protocol.collection.all_factors[field.factor]
         return tuple(factor.text(level) for level in self.enabled[field.factor])
 
-    def mass_kg(self, trial: Trial) -> float | None:
+    def mass_kg(self, trial: PlannedTrial) -> float | None:
         """Mass of the sliding plate in this trial; None if there is none."""
         plate = self.protocol.collection.plate
         if plate is None:
@@ -196,7 +196,7 @@ class Plan:
         mass = plate.mass
         return float(dict(trial.condition)[mass.factor] if isinstance(mass, FactorRef) else mass)
 
-    def tasks_before(self, trial: Trial) -> tuple[Task, ...]:
+    def tasks_before(self, trial: PlannedTrial) -> tuple[Task, ...]:
         """List the tasks before `trial`, in order, in an undisturbed campaign."""
         before = self.trials[trial.index - 1] if trial.index else None
         tasks = list(self.changeovers(before, trial))
@@ -211,13 +211,13 @@ class Plan:
             tasks.append(self.rezero_task(trial))
         return tuple(tasks)
 
-    def rezero_task(self, trial: Trial) -> Task:
+    def rezero_task(self, trial: PlannedTrial) -> Task:
         """The search for depth zero that `trial` relies on."""
         upkeep = self.protocol.collection.maintenance.rezero
         slot = 0 if upkeep is None else trial.index // upkeep.every
         return Task("rezero", False, "touch off to find depth zero", "", slot)
 
-    def changeovers(self, before: Trial | None, trial: Trial) -> tuple[Task, ...]:
+    def changeovers(self, before: PlannedTrial | None, trial: PlannedTrial) -> tuple[Task, ...]:
         """List what a person must change or do between two trials (or before the first)."""
         past = dict(before.condition) if before is not None else {}
         plate = self.protocol.collection.plate
@@ -467,7 +467,7 @@ def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:
     return ",".join(parts)
 
 
-def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iterator[Trial]:
+def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iterator[PlannedTrial]:
     collection = protocol.collection
     factors = collection.all_factors
     outer = [name for name in factors if factors[name].changeover == "person"]
@@ -479,10 +479,10 @@ def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iter
 
     def trial(
         condition: Mapping[str, Level], trial_id: str, repetition: int, role: Role, split: str
-    ) -> Trial:
+    ) -> PlannedTrial:
         ordered = tuple((name, condition[name]) for name in factors)
         seed = hash_integer(collection.seed, trial_id)
-        return Trial(index, trial_id, role, block, repetition, ordered, split, seed)
+        return PlannedTrial(index, trial_id, role, block, repetition, ordered, split, seed)
 
     stretches = []
     for outer_levels in product(*(levels[name] for name in outer)):
@@ -524,3 +524,7 @@ def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iter
                 index += 1
                 taken += 1
             block += 1
+
+
+Trial = PlannedTrial
+"""Its former name, which plug-ins import."""

@@ -17,13 +17,13 @@ from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.factors import Level
 from sliplab.protocols.hashing import hash_data, hash_integer
-from sliplab.protocols.plan import Trial
+from sliplab.protocols.plan import PlannedTrial
 
 _SCALE = float(1 << 63)
 
 
 @dataclass(frozen=True)
-class RecordedTrial:
+class TrialProperties:
     """Properties of a trial that the split needs.
 
     Attributes:
@@ -52,7 +52,7 @@ class RecordedPlan:
 
     adapter: Adapter
     file: str
-    recorded: tuple[RecordedTrial, ...] = field(repr=False)
+    recorded: tuple[TrialProperties, ...] = field(repr=False)
 
     @property
     def name(self) -> str:
@@ -65,11 +65,11 @@ class RecordedPlan:
     def __len__(self) -> int:
         return len(self.recorded)
 
-    def __iter__(self) -> Iterator[Trial]:
+    def __iter__(self) -> Iterator[PlannedTrial]:
         return iter(self.trials)
 
     @cached_property
-    def trials(self) -> tuple[Trial, ...]:
+    def trials(self) -> tuple[PlannedTrial, ...]:
         """The trials, each with its part of the split.
 
         Raises:
@@ -79,7 +79,7 @@ class RecordedPlan:
         ordered = sorted(self.recorded, key=lambda trial: natural(trial.id))
         parts = split_recorded(self.adapter, ordered, self.file)
         return tuple(
-            Trial(
+            PlannedTrial(
                 index,
                 trial.id,
                 "measured",
@@ -93,14 +93,14 @@ class RecordedPlan:
         )
 
     @cached_property
-    def _by_id(self) -> dict[str, RecordedTrial]:
+    def _by_id(self) -> dict[str, TrialProperties]:
         return {trial.id: trial for trial in self.recorded}
 
-    def describe(self, trial: Trial) -> dict[str, str]:
+    def describe(self, trial: PlannedTrial) -> dict[str, str]:
         """The trial's condition as text with units, by factor."""
         return dict(self._by_id[trial.id].condition)
 
-    def seconds(self, trial: Trial) -> float:
+    def seconds(self, trial: PlannedTrial) -> float:
         """Recorded seconds of one trial."""
         return self._by_id[trial.id].seconds
 
@@ -139,7 +139,9 @@ class RecordedPlan:
         return hash_data(self.adapter.model_dump(mode="json", include={"analysis", "split"}))
 
 
-def split_recorded(adapter: Adapter, trials: Sequence[RecordedTrial], file: str) -> dict[str, str]:
+def split_recorded(
+    adapter: Adapter, trials: Sequence[TrialProperties], file: str
+) -> dict[str, str]:
     """Return the part of each trial by id: ``train``, ``validation`` or ``test``.
 
     Trials are ranked by a hash inside their stratum: the class, or the condition. Trials that
@@ -195,7 +197,7 @@ def split_recorded(adapter: Adapter, trials: Sequence[RecordedTrial], file: str)
     return result
 
 
-def _field(trial: RecordedTrial, name: str, key: str, file: str) -> str:
+def _field(trial: TrialProperties, name: str, key: str, file: str) -> str:
     found = trial.fields.get(name, trial.condition.get(name))
     if found is None:
         known = sorted({*trial.fields, *trial.condition})

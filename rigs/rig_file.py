@@ -20,7 +20,6 @@ from sliplab.protocols.quantity import (
     PositiveMillimetres,
     PositiveNewtons,
     PositiveSeconds,
-    PositiveSpeed,
 )
 from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import DeviceClock, Timing
@@ -41,6 +40,7 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
+from sliplab.rigs.rig_limits import RigLimits
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -52,18 +52,6 @@ from sliplab.rigs.twin import TwinRecord
 
 CAMERAS = {"events": "event camera", "frames": "frame camera"}
 """Streams by name in rig files and protocols, and the devices that give them."""
-
-
-class RigLimits(StrictModel):
-    """Limits of this arm at this rig, whatever a protocol says."""
-
-    depth: PositiveMillimetres
-    speed: PositiveSpeed
-    reach: PositiveMillimetres
-    """Largest distance of the sensor's centre from the plate's centre."""
-    force: PositiveNewtons | None = None
-    """Largest force on the plate, in any direction, before the arm is stopped; needs a force
-    sensor."""
 
 
 class PapillaLayout(StrictModel):

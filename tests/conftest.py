@@ -80,9 +80,11 @@ def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Any:
 @pytest.fixture(scope="module")
 def own_study(ran: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A copy of the small study, which a module may change."""
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    return Store.open(shutil.copytree(ran[0][0].store, tmp_path_factory.mktemp("own") / "store"))
+    return TrialStore.open(
+        shutil.copytree(ran[0][0].store, tmp_path_factory.mktemp("own") / "store")
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import Detector
 from sliplab.analysis.detectors.registry import make_detector
 from sliplab.analysis.detectors.stored_scenes import fitted_to
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def named_detector(
@@ -31,7 +31,7 @@ def named_detector(
         if level is not None and not needs_training(made):
             return AtLevel(made, level)
         assert store is not None, "the request was checked"
-        fitted = fitted_to(Store(store), made, promise if level is None else None)
+        fitted = fitted_to(TrialStore(store), made, promise if level is None else None)
         return fitted if level is None else AtLevel(made, level)
     except BaseException:
         made.close()

@@ -70,7 +70,8 @@ SEEN_BLOCKS = SEEN_MS // PLACES_MS
 DISPERSION_MS = 60
 """Time over which the dispersion is averaged."""
 FEWEST_PLACES = 10
-"""Moving at once: a slide moves all papillae, an object that brushes over them a few."""
+"""Moving at once: a slide moves all papillae, an object that brushes over them a few. A calibrated
+skin may need fewer: `skin_measurement.fewest_places`. A change increments `VERSION`."""
 FEWEST_EVENTS = 20
 """Of a place in the memory, so that it says something."""
 CELL_EVENTS, PLACE_CELLS = 2, 4

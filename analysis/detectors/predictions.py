@@ -25,7 +25,7 @@ from sliplab.protocols.windows import Windows
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived, make_key
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 COUNTS = "counts"
 COUNTS_VERSION = 1
@@ -59,7 +59,7 @@ class _Inference:
 
 
 def count_spikes(
-    store: Store,
+    store: TrialStore,
     model: Path,
     trials: Sequence[tuple[str, Recording, str]],
     keep: KeepTrials,
@@ -151,7 +151,7 @@ def prediction_request(
 
 
 def predict_trials(
-    store: Store,
+    store: TrialStore,
     model: Path,
     requests: Sequence[PredictionRequest],
     keep: KeepTrials,
@@ -184,7 +184,7 @@ def predict_trials(
     return made
 
 
-def predictions(store: Store, request: PredictionRequest) -> Arrays:
+def predictions(store: TrialStore, request: PredictionRequest) -> Arrays:
     """Return ``counts`` int64 (n, 3), ``events`` int64 (n,) and ``end_ns`` int64 (n,)."""
     return Derived.of(store, request.step, request.campaign).arrays(request.recording.folder.name)
 
@@ -224,7 +224,7 @@ def _fitted(model: bytes) -> training.Fitted:
     return fitted
 
 
-def trial_counts(store: Store, campaign: str, trial_id: str, settings: Detection) -> Arrays:
+def trial_counts(store: TrialStore, campaign: str, trial_id: str, settings: Detection) -> Arrays:
     """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
     step = COUNTS if settings.stride_ms is None else predictions_step(settings.stride_ms)
     return Derived.of(store, step, campaign).arrays(trial_id)

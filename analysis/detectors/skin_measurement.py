@@ -44,7 +44,10 @@ class SkinError(ValueError):
 
 
 def fewest_places(papillae: int) -> int:
-    """Return how many places must move at once on a skin of so many papillae: half of them."""
+    """Return how many places must move at once on a skin of so many papillae.
+
+    Half of them, and at most `FEWEST_PLACES`.
+    """
     return min(FEWEST_PLACES, max(FEWEST, -(-papillae // 2)))
 
 

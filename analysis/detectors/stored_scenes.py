@@ -20,10 +20,10 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.detection import ComparisonSettings
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 
-def fitted_to(store: Store, detector: Detector, promise: float | None = None) -> AtLevel:
+def fitted_to(store: TrialStore, detector: Detector, promise: float | None = None) -> AtLevel:
     """Return a detector that the store's training trials trained, at the level of its validation.
 
     The level is the lowest at which at most the middle one of `compare.rates` of the validation

@@ -27,7 +27,7 @@ from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
 from sliplab.storage.schema.evaluation import BaselineResult, TrainedBaseline
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 STEP = "baselines"
 EVALUATION = "evaluation"
@@ -62,19 +62,19 @@ class Methods:
     epochs: int = EPOCHS
     batch: int = BATCH
 
-    def key(self, store: Store, name: str) -> str:
+    def key(self, store: TrialStore, name: str) -> str:
         """Return the key of results on the samples in the store."""
         saved = Derived.of(store, SAMPLES)
         parts = [saved.key(f"{self.prefix}{split}") for split in ("train", "validation", "test")]
         return make_key(STEP, VERSION, parts, [name, self.names[name]])
 
-    def fresh_keys(self, store: Store) -> list[str]:
+    def fresh_keys(self, store: TrialStore) -> list[str]:
         """Keys of the baselines that are there and belong to today's samples."""
         saved = Derived.of(store, STEP)
         keys = {name: self.key(store, name) for name in self.names}
         return [key for name, key in keys.items() if saved.fresh(f"{self.prefix}{name}", key)]
 
-    def results(self, store: Store) -> dict[str, TrainedBaseline]:
+    def results(self, store: TrialStore) -> dict[str, TrainedBaseline]:
         """Compare each baseline in the store with the network, by name; see `compared`.
 
         A network's figures of other windows than the baseline's are not compared.

@@ -27,7 +27,7 @@ from sliplab.protocols.detection import Detection
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.evaluation import DetectorComparison, RuleChoice
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class DetectorWork:
         ]
 
     def choices(
-        self, store: Store, detection: dict[str, Detection]
+        self, store: TrialStore, detection: dict[str, Detection]
     ) -> dict[str, RuleChoice | None]:
         """Smoothing and margin by campaign; None where the protocol says them."""
         found: dict[str, RuleChoice | None] = {}
@@ -99,7 +99,9 @@ class DetectorWork:
             found[name] = choose_smoothing(counted, settings, settings.choose)
         return found
 
-    def tune(self, store: Store, settings: AnalysisSettings, detection: Detection) -> list[Tuned]:
+    def tune(
+        self, store: TrialStore, settings: AnalysisSettings, detection: Detection
+    ) -> list[Tuned]:
         """Return detectors at the middle of the rates that are compared; none without a comparison.
 
         Args:
@@ -108,7 +110,7 @@ class DetectorWork:
         return tuned(_parts(store, self.compared), settings, detection)
 
     def promise(
-        self, store: Store, settings: AnalysisSettings, detection: Detection, rate: float
+        self, store: TrialStore, settings: AnalysisSettings, detection: Detection, rate: float
     ) -> list[PromisedRule]:
         """Return the same detectors at the levels that promise a rate, with their test figures.
 
@@ -119,7 +121,7 @@ class DetectorWork:
         return promised(_parts(store, self.compared), settings, detection, rate)
 
     def compare(
-        self, store: Store, settings: AnalysisSettings, detection: Detection
+        self, store: TrialStore, settings: AnalysisSettings, detection: Detection
     ) -> DetectorComparison | None:
         """Compare detectors; None where nothing is to be compared.
 
@@ -200,18 +202,18 @@ def detector_work(
     return DetectorWork(scored, choosing, compared(False), compared(True))
 
 
-def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts:
+def _parts(store: TrialStore, known: dict[str, list[KnownTrial]] | None) -> Parts:
     """The trials of a comparison, read; no trials without one."""
     names = ("train", "validation", "test")
     return Parts(*([_labelled(store, t) for t in (known or {}).get(name, ())] for name in names))
 
 
-def _labelled(store: Store, trial: KnownTrial) -> TrialWithSlip:
+def _labelled(store: TrialStore, trial: KnownTrial) -> TrialWithSlip:
     arrays = predictions(store, trial.request)
     windows = Predictions(arrays["counts"], arrays["events"], arrays["end_ns"])
     return TrialWithSlip(windows, trial.slip, trial.references)
 
 
-def _counted(store: Store, trial: KnownTrial) -> SpikeCounts:
+def _counted(store: TrialStore, trial: KnownTrial) -> SpikeCounts:
     arrays = predictions(store, trial.request)
     return SpikeCounts(arrays["counts"], arrays["end_ns"], trial.slip)

@@ -27,26 +27,26 @@ from sliplab.analysis.networks.models import (
     wanted_models,
 )
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import Evaluation, TrialScore
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 
 @dataclass(frozen=True)
 class EvaluationJob:
     """Everything an evaluation depends on, found before anything is computed."""
 
-    store: Store
+    store: TrialStore
     campaigns: list[Collected]
     labels: StoreLabels
     model: ModelOnDisk
     models: list[ModelOnDisk]
     """Models of all seeds, the chosen one included."""
     detection: dict[str, Detection]
-    trials: list[tuple[Collected, Trial, Recording, str]]
+    trials: list[tuple[Collected, PlannedTrial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
     detectors: DetectorWork
     key: str
@@ -75,7 +75,7 @@ FORMAT = (VERSION, WINDOWS_VERSION)
 
 
 def make_job(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
@@ -122,7 +122,7 @@ def make_job(
     return EvaluationJob(store, campaigns, labels, model, models, detection, trials, detectors, key)
 
 
-def evaluation_of(store: Store) -> Evaluation:
+def evaluation_of(store: TrialStore) -> Evaluation:
     """Return the store's evaluation.
 
     Raises:

@@ -15,7 +15,7 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import several
 from sliplab.storage.schema.holdout import HoldoutLook, HoldoutResult
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 STEP, NAME, VERSION = "holdout", "results", 1
 
@@ -33,7 +33,7 @@ class Holdout:
     """
 
     def __init__(
-        self, store: Store, campaigns: list[Collected], trials: int, seeds: tuple[int, int]
+        self, store: TrialStore, campaigns: list[Collected], trials: int, seeds: tuple[int, int]
     ) -> None:
         self.folder, self.seeds, self.trials = store.folder / STEP, seeds, trials
         self.results = Derived(self.folder)
@@ -72,7 +72,7 @@ class Holdout:
         """Return whether a version of the program evaluated the campaign already."""
         return program in [each.version for each in self.evaluations()]
 
-    def score(self, store: Store, campaigns: list[Collected]) -> HoldoutResult:
+    def score(self, store: TrialStore, campaigns: list[Collected]) -> HoldoutResult:
         """Score the labelled trials of the campaign; return figures and ledger."""
         fitted = model_file.load(self.model.path)
         judged = judge(fitted, {self.item.name: self.detection}, store, campaigns)

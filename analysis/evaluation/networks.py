@@ -39,7 +39,7 @@ from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived, make_key
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 STEP = "other_networks"
 VERSION = 1
@@ -147,7 +147,7 @@ class Judgement:
         about: preset and seed of its training; None where a file brought it.
     """
 
-    store: Store
+    store: TrialStore
     campaigns: list[Collected]
     labels: StoreLabels
     network: OtherNetwork
@@ -278,7 +278,7 @@ def data_key(labels: StoreLabels, campaigns: list[Collected]) -> str:
 
 
 def retained(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
+    store: TrialStore, campaigns: list[Collected], reviewed: bool = False
 ) -> dict[str, OtherEvaluation]:
     """Results on the trials and labels of today, by name."""
     folder = Derived.of(store, STEP)

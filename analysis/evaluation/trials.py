@@ -26,7 +26,7 @@ from sliplab.analysis.networks import training
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.detection import Detection
 from sliplab.storage.schema.evaluation import (
     AlarmRate,
@@ -38,12 +38,12 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.schema.holdout import HoldoutScores
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def score_row(
     item: Collected,
-    trial: Trial,
+    trial: PlannedTrial,
     label: TrialLabel,
     counts: npt.NDArray[Any],
     end_ns: npt.NDArray[Any],
@@ -195,7 +195,7 @@ class EvaluatedTrials:
 def judge(
     fitted: Fitted,
     detection: Mapping[str, Detection],
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
 ) -> EvaluatedTrials:
     """Score the labelled test trials of a store by a network that another store trained.

@@ -40,7 +40,7 @@ from sliplab.storage.schema.evaluation import (
     WindowScores,
 )
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 VERSION = 4
 STEP = "windows"
@@ -217,7 +217,7 @@ def compared(
 
 
 def kept_counts(
-    store: Store, evaluated: str | None, of: str = ""
+    store: TrialStore, evaluated: str | None, of: str = ""
 ) -> dict[str, npt.NDArray[Any]] | None:
     """``counts`` (n, classes), ``y`` (n,) and ``trial`` (n,) of an evaluation's test windows.
 
@@ -230,7 +230,7 @@ def kept_counts(
     return saved.arrays(name) if evaluated is not None and saved.fresh(name, evaluated) else None
 
 
-def window_intervals(store: Store, evaluated: str | None) -> WindowIntervals | None:
+def window_intervals(store: TrialStore, evaluated: str | None) -> WindowIntervals | None:
     """Return intervals over trials of the test windows' figures; None without stored counts.
 
     Args:

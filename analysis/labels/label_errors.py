@@ -19,7 +19,7 @@ from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
 from sliplab.storage.schema.summary import HoldSummary
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
@@ -32,7 +32,7 @@ _TRUTH: dict[Rule, dict[Kind, str]] = {
 the hold, or the true start of the slip in the motion."""
 
 
-def label_errors(store: Store, campaigns: list[Collected]) -> LabelErrors:
+def label_errors(store: TrialStore, campaigns: list[Collected]) -> LabelErrors:
     """Errors of ruling labels against their rule's true onsets, over all simulated trials; ms."""
     rules = {item.settings.labelling.rule for item in campaigns}
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
@@ -47,7 +47,7 @@ def label_errors(store: Store, campaigns: list[Collected]) -> LabelErrors:
     )
 
 
-def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
+def rules_compared(store: TrialStore, campaigns: list[Collected]) -> RuleErrors:
     """Errors of both rules against the truth, and the paper's less the change point's onset, ms."""
     found: dict[str, dict[str, list[float]]] = {
         name: {kind: [] for kind in KINDS} for name in ("paper", "change_point", "apart")
@@ -83,7 +83,7 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
 
 
 def force_compared(
-    store: Store, campaigns: Sequence[Collected]
+    store: TrialStore, campaigns: Sequence[Collected]
 ) -> dict[tuple[str, Kind], list[float]]:
     """Onsets by the force less those of the other rules, and less the true crossing, ms.
 
@@ -110,7 +110,7 @@ def force_compared(
     return apart
 
 
-def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, HoldSummary]:
+def holds_compared(store: TrialStore, campaigns: list[Collected]) -> dict[str, HoldSummary]:
     """Slips in the hold by campaign, and how far apart onsets from its two ends are.
 
     For each campaign `trials`; `slipped`, how many moved by more than `limit_px` (the protocol's
@@ -145,7 +145,7 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, HoldSu
     return found
 
 
-def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, list[float]]]:
+def distances(store: TrialStore, campaigns: list[Collected]) -> dict[str, dict[str, list[float]]]:
     """Every trial's distance of each rule's onset from its own truth, ms, by rule and kind.
 
     Rules of which no truth is known are left out.
@@ -176,7 +176,7 @@ def spread(values: list[float]) -> SignedDeviation:
 
 
 def _cases(
-    store: Store, campaigns: list[Collected]
+    store: TrialStore, campaigns: list[Collected]
 ) -> Iterator[tuple[Rule, Kind, TrialLabel, int | None]]:
     """Rule, kind, label and the time that is true of them, or None."""
     for item in campaigns:
@@ -213,7 +213,7 @@ def _last_other(times: list[int | None], centre: int) -> int | None:
     return max(slipped) if slipped and len(slipped) == len(others) else None
 
 
-def read_check(store: Store) -> LabelCheck | None:
+def read_check(store: TrialStore) -> LabelCheck | None:
     """Return the figures of the last check; None if there is none."""
     stored = Derived.of(store, CHECK)
     return stored.load(CHECK, LabelCheck) if stored.key(CHECK) is not None else None

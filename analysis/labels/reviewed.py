@@ -17,7 +17,7 @@ from sliplab.storage.schema.label import LABELS, OnsetDoubts, TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Decision, last
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 VERSION = 1
 State = Literal["open", "accepted", "adjusted", "rejected", "stale"]
@@ -54,7 +54,7 @@ class StoreLabels:
         reviewed: people's decisions are applied.
     """
 
-    store: Store
+    store: TrialStore
     reviewed: bool = False
 
     def fresh(self, item: Collected, recording: Recording) -> bool:

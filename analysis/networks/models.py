@@ -15,7 +15,7 @@ from sliplab.protocols.network_settings import MARGIN
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.derived import make_key
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, 
 
 
 def wanted_models(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     reviewed: bool = False,
     classes: tuple[str, ...] = (),
@@ -102,7 +102,7 @@ def wanted_models(
 
 
 def comparison_models(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
+    store: TrialStore, campaigns: list[Collected], reviewed: bool = False
 ) -> list[ModelOnDisk]:
     """Models of the comparison network that `analysis.also` names; none without one."""
     settings = training_settings(campaigns).comparison_settings()

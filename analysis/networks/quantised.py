@@ -110,7 +110,7 @@ def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:
 
 
 def common_net(fitted: Fitted, found: Quantised) -> nn.Sequential:
-    """The network in whole numbers with one threshold, as `networks.spiking.Engine` takes it.
+    """The network in whole numbers with one threshold, as `networks.spiking.SpikeEngine` takes it.
 
     Raises:
         ValueError: as `common_threshold`.

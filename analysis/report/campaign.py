@@ -15,7 +15,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Content, Figure, Table, number
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.recorded import RecordedPlan
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.summary import (
@@ -28,7 +28,7 @@ from sliplab.storage.schema.summary import (
 )
 from sliplab.storage.schema.trial import Gate
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 FEWEST = 3
 """Fewest reference trials from which a slope can be estimated."""
@@ -128,7 +128,7 @@ def source_words(summary: Summary | OneCameraSummary) -> str:
 
 
 def grid_figure(
-    campaign: str, plan: Plan | RecordedPlan, committed: Sequence[Trial], *, simulated: bool
+    campaign: str, plan: Plan | RecordedPlan, committed: Sequence[PlannedTrial], *, simulated: bool
 ) -> tuple[str, str, str, Figure] | None:
     """Draw the trials by the first two factors, with their names; None if there are fewer."""
     names = list(plan.levels)[:2]
@@ -138,7 +138,7 @@ def grid_figure(
     shape = (len(levels[0]), len(levels[1]))
     counts, planned = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
 
-    def cell(trial: Trial) -> tuple[int, int]:
+    def cell(trial: PlannedTrial) -> tuple[int, int]:
         there = plan.describe(trial)
         return levels[0].index(there[names[0]]), levels[1].index(there[names[1]])
 
@@ -317,7 +317,7 @@ def _depth_zeros(taken: Sequence[Collected]) -> list[Table]:
     return [Table(columns, rows, caption)] if rows else []
 
 
-def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, ReferenceSummary]:
+def references_of(store: TrialStore, campaigns: Sequence[Collected]) -> dict[str, ReferenceSummary]:
     """Return reference trials and wear by campaign, of those that take any."""
     found = {item.name: reference_trials(store, item) for item in campaigns}
     return {
@@ -327,7 +327,7 @@ def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, Ref
     }
 
 
-def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
+def reference_trials(store: TrialStore, item: Collected) -> list[ReferenceTrial]:
     """Return the measurements of each committed reference trial, in the plan's order."""
     labels = Derived.of(store, LABELS, item.name)
     found = []

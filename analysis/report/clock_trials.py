@@ -15,7 +15,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.storage.schema.trial import DEVICES, Gate, SyncResult, TrialClockMaps
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import SYNC, Store
+from sliplab.storage.trials.store import SYNC, TrialStore
 
 F64 = npt.NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def device_names(trials: Iterable[TrialClocks]) -> tuple[str, ...]:
     return (*DEVICES, *sorted(further))
 
 
-def read_trials(store: Store, item: Collected) -> list[TrialClocks]:
+def read_trials(store: TrialStore, item: Collected) -> list[TrialClocks]:
     """Read the trials of a campaign, in the order in which they were taken."""
     results = Derived.of(store, SYNC, item.name)
     taken = sorted(

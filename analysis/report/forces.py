@@ -15,7 +15,7 @@ from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 _MEAN = 10
 """Samples whose means are drawn."""
@@ -49,7 +49,7 @@ class ForceSection(Content):
 
 
 def force_section(
-    store: Store, campaigns: Sequence[Collected], shown: Recording | None, *, simulated: bool
+    store: TrialStore, campaigns: Sequence[Collected], shown: Recording | None, *, simulated: bool
 ) -> ForceSection | None:
     """Show the forces of the trials that have any; None where none has.
 
@@ -103,7 +103,7 @@ def force_section(
 
 
 def _label(
-    store: Store, there: Sequence[tuple[Collected, Recording]], drawn: Recording
+    store: TrialStore, there: Sequence[tuple[Collected, Recording]], drawn: Recording
 ) -> TrialLabel | None:
     for item, recording in there:
         labels = Derived.of(store, LABELS, item.name)
@@ -130,7 +130,7 @@ def _figures(there: Sequence[tuple[Collected, Recording]]) -> Table:
     return Table(("campaign", "of each trial", "trials", "least", "median", "most"), rows)
 
 
-def _rules(store: Store, campaigns: Sequence[Collected]) -> Table:
+def _rules(store: TrialStore, campaigns: Sequence[Collected]) -> Table:
     """List onsets by the force less those of the other rules, and less the truth where known."""
     columns = (
         "force less the",

@@ -16,7 +16,7 @@ from sliplab.storage.schema.evaluation import ChangePointCoverage, LabelCheck, R
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
 from sliplab.storage.schema.summary import HoldSummary, OneCameraSummary, Summary
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 RULES = {"paper": "paper's rule", "change_point": "change point"}
 RULING = {
@@ -55,7 +55,7 @@ class LabelSection(Content):
 
 
 def label_section(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     summary: Summary | OneCameraSummary,
 ) -> LabelSection | None:

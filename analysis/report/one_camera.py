@@ -37,7 +37,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.schema.summary import LabelSummary, MotionRate, OneCameraSummary, StepLeftOut
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 F64 = npt.NDArray[np.float64]
 BEFORE_S, BIN_S = 1.0, 0.1
@@ -46,7 +46,7 @@ NO_LABELS = "not done yet; run `sliplab label`"
 NO_CLASSIFIER = "not done yet; run `sliplab train`, then `sliplab evaluate`"
 
 
-def is_evaluated(store: Store, campaigns: Sequence[Collected]) -> bool:
+def is_evaluated(store: TrialStore, campaigns: Sequence[Collected]) -> bool:
     """Check that the spiking network was evaluated on trials without frames."""
     if missing_stream(list(campaigns)) != "frames" or not has_labels(store, campaigns):
         return False
@@ -57,14 +57,14 @@ def is_evaluated(store: Store, campaigns: Sequence[Collected]) -> bool:
     return True
 
 
-def has_labels(store: Store, campaigns: Sequence[Collected]) -> bool:
+def has_labels(store: TrialStore, campaigns: Sequence[Collected]) -> bool:
     """Check that every trial has its label."""
     labels = KeptLabels(store)
     return all(labels.fresh(item, trial) for item in campaigns for _, trial in item.trials)
 
 
 def one_camera_key(
-    store: Store, campaigns: list[Collected], evaluations: Sequence[str] = ()
+    store: TrialStore, campaigns: list[Collected], evaluations: Sequence[str] = ()
 ) -> str:
     """Return the key of all inputs of the report.
 
@@ -93,7 +93,7 @@ def one_camera_key(
 
 
 def one_camera_summary(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     planned_bytes: Mapping[str, int],
     *,
@@ -255,7 +255,7 @@ def rate_section(campaigns: Sequence[Collected], summary: OneCameraSummary) -> R
 
 
 def one_camera_sections(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     summary: OneCameraSummary,
     own: Sequence[Content] = (),

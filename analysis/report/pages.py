@@ -13,7 +13,7 @@ from sliplab.analysis.report.sources import read_sources, report_key
 from sliplab.analysis.report.summary import make_summary
 from sliplab.storage.schema.summary import OneCameraSummary
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Page:
     simulated: bool
 
 
-def slip_report_key(store: Store, campaigns: list[Collected]) -> str:
+def slip_report_key(store: TrialStore, campaigns: list[Collected]) -> str:
     """Return the key of all inputs of the page about slip.
 
     Raises:
@@ -45,7 +45,7 @@ def slip_report_key(store: Store, campaigns: list[Collected]) -> str:
 
 
 def slip_page(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     planned_bytes: Callable[[Collected], int],
     seconds: Mapping[str, float],
@@ -68,7 +68,7 @@ def slip_page(
 
 
 def _evaluated(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     planned: Mapping[str, int],
     seconds: Mapping[str, float],

@@ -14,7 +14,7 @@ from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import plural
 from sliplab.storage.files import safe_name
 from sliplab.storage.schema.summary import OneCameraSummary, Summary
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class ReportData:
         summary: the report's figures; None where only the key of a section is needed.
     """
 
-    store: Store
+    store: TrialStore
     campaigns: Sequence[Collected]
     simulated: bool
     summary: Summary | OneCameraSummary | None = None
@@ -54,7 +54,7 @@ class ReportSection:
     """
 
     make: Callable[[ReportData], Content | None]
-    key: Callable[[Store, Sequence[Collected]], Sequence[Any]] | None = None
+    key: Callable[[TrialStore, Sequence[Collected]], Sequence[Any]] | None = None
     last: bool = False
 
 
@@ -91,7 +91,7 @@ def plugin_sections(data: ReportData, *, last: bool = False) -> Iterator[Content
         yield LostSections(faults)
 
 
-def sections_key(store: Store, campaigns: Sequence[Collected]) -> list[Any]:
+def sections_key(store: TrialStore, campaigns: Sequence[Collected]) -> list[Any]:
     """Return what the sections of plug-ins depend on besides; empty where they show nothing."""
     found: list[Any] = []
     data = ReportData(store, campaigns, store.simulated)

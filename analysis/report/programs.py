@@ -16,7 +16,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
 from sliplab.storage.schema.document import Document
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 DocumentT = TypeVar("DocumentT", bound=Document)
 
@@ -33,7 +33,7 @@ class CommandResult:
     file: str
     text: str
 
-    def read(self, store: Store) -> Json | None:
+    def read(self, store: TrialStore) -> Json | None:
         """Read the results; None where there are none.
 
         Raises:
@@ -47,12 +47,12 @@ class CommandResult:
         except (OSError, ValueError) as error:
             raise StoreError(f"{error}; delete {path}, or make it again") from None
 
-    def key(self, store: Store, campaigns: object) -> list[Json]:
+    def key(self, store: TrialStore, campaigns: object) -> list[Json]:
         """Return the results for a report's key; empty where there are none. Raises StoreError."""
         found = self.read(store)
         return [] if found is None else [found]
 
-    def command(self, store: Store) -> str:
+    def command(self, store: TrialStore) -> str:
         """Return the command for a store."""
         path = store.folder.resolve() / self.file
         return self.text.format(store=store.folder.resolve(), folder=path.parent, file=path)
@@ -88,7 +88,7 @@ RESULTS = {"holdout": HOLDOUT, "stress": STRESS}
 """Results that the summary has figures of."""
 
 
-def read_programs(store: Store) -> dict[str, Json]:
+def read_programs(store: TrialStore) -> dict[str, Json]:
     """Read the `RESULTS` that there are, by name.
 
     Raises:

@@ -22,7 +22,7 @@ from sliplab.storage.trials.registration import (
     registrations,
     stamps,
 )
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store
+from sliplab.storage.trials.store import IMPORTED, Campaign, TrialStore
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class RegistrationSection(Content):
         ]
 
 
-def registration_key(store: Store, campaigns: list[Collected]) -> list[str]:
+def registration_key(store: TrialStore, campaigns: list[Collected]) -> list[str]:
     """Return what a report with registrations depends on besides; empty without any."""
     section = registration_section(store, campaigns)
     if section is None or not (section.absent or any(it.after for it in section.campaigns)):
@@ -75,7 +75,9 @@ def registration_key(store: Store, campaigns: list[Collected]) -> list[str]:
     return [hash_data([tables, section.absent])]
 
 
-def registration_section(store: Store, campaigns: list[Collected]) -> RegistrationSection | None:
+def registration_section(
+    store: TrialStore, campaigns: list[Collected]
+) -> RegistrationSection | None:
     """Show registrations of collected campaigns; None where all were imported."""
     collected = [item for item in campaigns if IMPORTED not in item.info]
     shown = {item.name for item in collected}
@@ -89,7 +91,7 @@ def registration_section(store: Store, campaigns: list[Collected]) -> Registrati
     return RegistrationSection([_registered(store, campaigns, it) for it in collected], absent)
 
 
-def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Registered:
+def _registered(store: TrialStore, campaigns: list[Collected], item: Collected) -> Registered:
     files: list[list[str]] = []
     found: list[RegistrationDeviation] = []
     after, rig = "", False
@@ -121,7 +123,7 @@ def _registered(store: Store, campaigns: list[Collected], item: Collected) -> Re
 
 
 def _evaluation_deviations(
-    store: Store, campaigns: list[Collected], item: Collected
+    store: TrialStore, campaigns: list[Collected], item: Collected
 ) -> Iterator[RegistrationDeviation]:
     """Yield options of `sliplab evaluate` that took the place of the protocol's settings."""
     try:

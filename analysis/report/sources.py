@@ -30,13 +30,13 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.schema.summary import HoldSummary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 STEP = "report"
 VERSION = 13
 
 
-def report_folder(store: Store) -> Path:
+def report_folder(store: TrialStore) -> Path:
     """Return the folder of the report."""
     return store.folder / "report"
 
@@ -56,7 +56,7 @@ class Sources:
         programs: results of other programs, by name.
     """
 
-    store: Store
+    store: TrialStore
     campaigns: Sequence[Collected]
     settings: AnalysisSettings
     evaluation: Evaluation
@@ -71,7 +71,7 @@ class Sources:
     references: Mapping[tuple[str, str], References]
 
 
-def report_key(store: Store, campaigns: list[Collected]) -> str:
+def report_key(store: TrialStore, campaigns: list[Collected]) -> str:
     """Return the key of all that the report is made of.
 
     Raises:
@@ -108,7 +108,7 @@ def report_key(store: Store, campaigns: list[Collected]) -> str:
 
 
 def read_sources(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     planned_bytes: Mapping[str, int],
     step_seconds: Mapping[str, float],

@@ -46,7 +46,7 @@ from sliplab.storage.schema.summary import (
     Sync,
 )
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.versions import FIGURES, installed_versions
 
 Slips = Mapping[tuple[str, str], References]
@@ -132,7 +132,7 @@ def make_summary(sources: Sources) -> Summary:
     )
 
 
-def evaluation_numbers(store: Store, campaigns: list[Collected]) -> Json:
+def evaluation_numbers(store: TrialStore, campaigns: list[Collected]) -> Json:
     """Return the numbers of the evaluation under the report's keys, without a report.
 
     Raises:

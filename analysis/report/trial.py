@@ -24,7 +24,7 @@ from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 F64 = npt.NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class TrialSection(Content):
     fault: str = ""
 
 
-def trial_section(store: Store, example: Example, *, simulated: bool) -> TrialSection:
+def trial_section(store: TrialStore, example: Example, *, simulated: bool) -> TrialSection:
     """Draw the trial."""
     item, recording = example.item, example.recording
     frame_ns, displacement_px = np.empty(0, np.int64), np.empty((0, 0))

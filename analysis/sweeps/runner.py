@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy.typing as npt
 
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.storage.files import make_folder, read_json, write_json
 from sliplab.storage.schema.document import Document, Part
@@ -203,7 +203,7 @@ def task_sweep(tasks: Sequence[SweepTask], results: Results) -> Sweep[SweepTask]
     return Sweep(tasks, results, lambda task, advance: (task.work(), None))
 
 
-def sample_trials(plan: Plan, count: int) -> list[Trial]:
+def sample_trials(plan: Plan, count: int) -> list[PlannedTrial]:
     """Return `count` measured trials that use each level as evenly as can be.
 
     Ties are decided by hashes of the protocol's seed and the trials' ids. All trials if there
@@ -212,7 +212,7 @@ def sample_trials(plan: Plan, count: int) -> list[Trial]:
     seed = plan.protocol.collection.seed
     left = [trial for trial in plan if trial.role == "measured"]
     left.sort(key=lambda trial: hash_integer(seed, "trade-off", trial.id))
-    chosen: list[Trial] = []
+    chosen: list[PlannedTrial] = []
     while left and len(chosen) < count:
         used = [level for trial in chosen for level in trial.condition]
         best = min(left, key=lambda trial: sum(used.count(level) for level in trial.condition))

@@ -14,7 +14,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.trial_work import EachTrial, TrialWork, in_order
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.windows import SampleSettings, Windows
 from sliplab.storage.schema.label import TrialLabel
@@ -27,7 +27,7 @@ CLASS_PREFIX = "classes-"
 _FORMAT = "trials by name"
 _BY_PLACE = "numbered by place"
 """Part of keys over several campaigns, since windows are identified by their trial."""
-TrialRef = tuple[Collected, Trial, Recording]
+TrialRef = tuple[Collected, PlannedTrial, Recording]
 """A trial with its campaign and its recording."""
 
 

@@ -27,7 +27,7 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.sample_sets import several
 from sliplab.storage.schema.evaluation import TrialLatency
 from sliplab.storage.trials.derived import make_key
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 STEP, FILE, VERSION = "guesses", "results.json", 1
 FIGURES = {
@@ -57,7 +57,7 @@ class StudySensitivity:
         StoreError: not simulated, or not evaluated yet.
     """
 
-    def __init__(self, store: Store, campaigns: list[Collected], trials: int) -> None:
+    def __init__(self, store: TrialStore, campaigns: list[Collected], trials: int) -> None:
         self.campaigns = campaigns
         self.folder = store.folder / "derived" / STEP
         if not all(item.info.get("simulated") for item in campaigns):
@@ -90,7 +90,7 @@ class StudySensitivity:
         self,
         setting: ParameterSetting,
         value: float | None,
-        store: Store,
+        store: TrialStore,
         campaigns: list[Collected],
     ) -> SettingScores:
         """Score the trials that were repeated at a setting.

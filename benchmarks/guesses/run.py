@@ -23,7 +23,7 @@ from sliplab.flows.running import console
 from sliplab.plugins.simulation.settings import MockSettings, scene_of
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 TRIALS = 20
 
@@ -45,7 +45,7 @@ class SettingsMeasured:
 
 
 def measure_guesses(
-    store: Store, campaigns: list[Collected], guesses: Sequence[str], trials: int
+    store: TrialStore, campaigns: list[Collected], guesses: Sequence[str], trials: int
 ) -> SettingsMeasured:
     """Measure what is missing; return the figures of all settings that were requested.
 

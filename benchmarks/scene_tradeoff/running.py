@@ -21,12 +21,12 @@ from sliplab.plugins.simulation.levels import HIGHEST, expected_onsets, slides_o
 from sliplab.plugins.simulation.scene.onsets import retraction_onsets
 from sliplab.plugins.simulation.scene_runs import SceneRun, changed, ideal, run, timed
 from sliplab.plugins.simulation.settings import scene_of, skin_of
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.program import Move
 from sliplab.rigs.rig_file import RigFile
 
 
-def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> ClosedForm | None:
+def closed_form(rig: RigFile, plan: Plan, trial: PlannedTrial) -> ClosedForm | None:
     """Return first slip and the centre's (or the plate's fall) at level L0.
 
     None if there is no closed form: a retraction that also goes sideways.
@@ -63,7 +63,7 @@ class VariantJob:
 
     rig: RigFile
     plan: Plan
-    trial: Trial
+    trial: PlannedTrial
     families: Families
 
 

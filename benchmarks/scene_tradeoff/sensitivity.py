@@ -23,7 +23,7 @@ from sliplab.plugins.simulation.levels import HIGHEST, slides_of
 from sliplab.plugins.simulation.physics import springs_of
 from sliplab.plugins.simulation.scene_runs import SceneRun, changed, run, with_true_times
 from sliplab.plugins.simulation.settings import MockSettings, scene_of, skin_of
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.program import Move
 from sliplab.rigs.physics_levels import with_level
 from sliplab.rigs.rig_file import RigFile
@@ -48,7 +48,7 @@ class OutcomeJob:
 
     rig: RigFile
     plan: Plan
-    trials: Sequence[Trial]
+    trials: Sequence[PlannedTrial]
     other_seed: bool = False
     known: SceneOutcome | None = None
 
@@ -79,7 +79,7 @@ def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Scene
 
 
 def _slide_onsets(
-    mock: MockSettings, plan: Plan, trial: Trial, seed: int
+    mock: MockSettings, plan: Plan, trial: PlannedTrial, seed: int
 ) -> tuple[float, float] | None:
     """Return first slip and duration of incipient slip by contact alone, s; None: no slide."""
     slides = slides_of(replace(plan, trials=(trial,)))

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from benchmarks.scene_tradeoff.error import SceneError, choose_by_windows, compare, mean_error
 from benchmarks.scene_tradeoff.windows import SceneWindows, look, pooled
 from sliplab.plugins.simulation.scene_runs import Onsets, SceneRun
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.windows import Windows
@@ -39,7 +39,7 @@ class Variant:
         scene = {"level": f"L{self.level}", "step_ms": self.step_ms}
         return {"scene": scene, "event_camera": {"path": self.path}, "faults": ()}
 
-    def seed(self, trial: Trial) -> int:
+    def seed(self, trial: PlannedTrial) -> int:
         """Return the trial's seed, as a campaign's first attempt has it, or another one."""
         return hash_integer(trial.seed, "another seed" if self.other_seed else 0)
 

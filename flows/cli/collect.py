@@ -35,7 +35,7 @@ def plan(
         Path | None,
         typer.Option(
             "--pilot",
-            help="Folder of a store with labelled trials, to foretell when the protocol's claims "
+            help="Folder of a store with labelled trials, to predict when the protocol's claims "
             "end the campaign.",
         ),
     ] = None,
@@ -49,7 +49,7 @@ def plan(
     found = load_plan(protocol, enable or (), True)
     needed, scene = None, None
     if rig is not None:
-        from sliplab.flows.planning.estimate import plan_bytes
+        from sliplab.flows.planning.size_estimate import plan_bytes
         from sliplab.rigs.rig_file import check_plan, load_rig_file
 
         rig_file, _ = load_rig_file(rig)
@@ -110,15 +110,17 @@ def collect(
     from sliplab.flows.planning.run_request import check_disk, make_request
     from sliplab.flows.register import registration_line
     from sliplab.flows.running import orchestration
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     run_request = make_request(protocol, rig, store, **options.arguments())
     for warning in run_request.plan.warnings():
         console.say(f"note: {warning}")
-    console.say(registration_line(Store(store).campaign(run_request.campaign), run_request.plan))
+    console.say(
+        registration_line(TrialStore(store).campaign(run_request.campaign), run_request.plan)
+    )
     check_disk([run_request])
     prepare_store(store)
-    if run_request.due_trials(Store(store).campaign(run_request.campaign)):
+    if run_request.due_trials(TrialStore(store).campaign(run_request.campaign)):
         orchestration.start_server()  # starts while the imports below load
     from sliplab.flows.collect import collect as collect_trials
 

@@ -13,7 +13,7 @@ from sliplab.flows.steps import located, prepare_store, run_step
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
 PLAN, COLLECT, RIG, ANALYSE, DATA = "Plan", "Collect", "Rig", "Analyse", "Data"
 RESEARCH = "Research"
@@ -81,7 +81,7 @@ def _shown(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:
+def opened_campaigns(folder: Path, names: list[str] | None) -> tuple[TrialStore, list[Collected]]:
     """Return a store and its campaigns, before anything imports Prefect."""
     from sliplab.analysis.campaigns import collected
     from sliplab.storage.remote.mirror import open_store

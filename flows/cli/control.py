@@ -67,9 +67,9 @@ def stop(
 ) -> None:
     """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
     from sliplab.flows.collecting.requests import halt
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     halted = halt(store)  # before anything that takes long to load
     from sliplab.flows.collecting import requests
 
@@ -114,9 +114,9 @@ def again(
 
 def _request(store: Path, kind: Kind, wanted: ControlOptions) -> RequestOutcome:
     from sliplab.flows.collecting import requests
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    return requests.ask(Store.open(store), kind, **wanted.arguments())
+    return requests.ask(TrialStore.open(store), kind, **wanted.arguments())
 
 
 def _decide(
@@ -130,11 +130,11 @@ def _decide(
 ) -> None:
     from sliplab.flows.collecting import requests
     from sliplab.protocols.errors import InputError
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     if not why.strip():
         raise InputError("--why", "", why, "must not be empty: it is stored with the trial")
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     by_campaign = requests.known_trials(opened, [campaign] if campaign else None, trials)
     outcomes = [
         requests.ask(opened, kind, why=why, campaign=name, trials=ids, **requester.arguments())

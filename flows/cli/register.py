@@ -93,9 +93,9 @@ def _show(protocol: Path, store: Path, campaign: str | None, as_json: bool) -> N
     from sliplab.analysis.report.registration import registration_section
     from sliplab.flows.register import registration_line
     from sliplab.protocols.plan import load_plan
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened, plan = Store.open(store), load_plan(protocol)
+    opened, plan = TrialStore.open(store), load_plan(protocol)
     found = opened.campaign(campaign or plan.name)
     line = registration_line(found, plan)
     section = registration_section(opened, collected(opened, [found.name])) if found.begun else None
@@ -117,9 +117,9 @@ def _attach(protocol: Path, store: Path, campaign: str | None, stamp: Path, as_j
     """
     from sliplab.protocols.plan import load_plan
     from sliplab.storage.trials.registration import attach_stamp, registration_files
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    found = Store.open(store).campaign(campaign or load_plan(protocol).name)
+    found = TrialStore.open(store).campaign(campaign or load_plan(protocol).name)
     files = registration_files(found)
     if not files:
         raise InputError("--stamp", "", str(stamp), f"{found.folder} has no registration yet")

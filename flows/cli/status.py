@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from sliplab.flows.status import CampaignStatus, StoreStatus
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
 app = typer.Typer()
 
@@ -36,11 +36,11 @@ def status(
     """Show who collects, how far each campaign is, when it ends, and what needs a person."""
     from sliplab.flows.running import stopping
     from sliplab.flows.status import StatusReader
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     if watch and as_json:
         raise InputError("--watch", "", "--json", "cannot be combined: --json prints one object")
-    reader = StatusReader(Store.open(store))
+    reader = StatusReader(TrialStore.open(store))
     found = reader.read()
     if as_json:
         console.print_json(vars(found))
@@ -84,9 +84,9 @@ def log(
     Both may be added while trials are taken: every trial from the next one on is stored with them.
     """
     from sliplab.flows.log import log_entries
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     changed = _pairs([*(context or []), *([] if skin is None else [f"skin={skin}"])])
     if text is not None or changed:
         _add(opened, text, changed, campaign, who, as_json)
@@ -132,7 +132,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
 
 
 def _add(
-    store: Store,
+    store: TrialStore,
     text: str | None,
     context: dict[str, str],
     campaigns: list[str] | None,

@@ -21,7 +21,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, plural
 
 if TYPE_CHECKING:
-    from sliplab.storage.trials.store import Campaign, Store
+    from sliplab.storage.trials.store import Campaign, TrialStore
 
 app = typer.Typer()
 
@@ -160,9 +160,9 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     from sliplab.storage.trials.lock import exclusive
     from sliplab.storage.trials.migrate import migrate as migrate_store
     from sliplab.storage.trials.migrate import retained
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     with (
         translated_disk_errors(opened.folder),
         exclusive(opened.folder / ".lock", f"the store {opened.folder}"),
@@ -219,9 +219,9 @@ def push(
     from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.push import PushOptions
     from sliplab.storage.remote.push import push as send
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     chosen = _chosen(opened, campaign)
     remote = Remote(url)
     options = PushOptions(quarantine, replace, not sizes_only, check)
@@ -272,7 +272,7 @@ def pull(
     _finish({"url": url, "store": str(store), **vars(done)}, "pull", as_json)
 
 
-def _chosen(store: Store, names: list[str] | None) -> list[Campaign]:
+def _chosen(store: TrialStore, names: list[str] | None) -> list[Campaign]:
     there = {campaign.name: campaign for campaign in store.campaigns()}
     for name in names or ():
         if name not in there:

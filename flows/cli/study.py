@@ -127,11 +127,11 @@ def _chain(
     from sliplab.flows.report import read_one_camera, read_summary
     from sliplab.flows.study import searches
     from sliplab.flows.study import study as run
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     _note_seeds(run_requests)
     outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)
-    store = Store.open(folder)
+    store = TrialStore.open(folder)
     one_camera = read_one_camera(store)
     summary = read_summary(store) if one_camera is None else one_camera
     page = folder / "report" / "index.html"

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import cv2
 
     from sliplab.flows.planning.run_request import RunRequest
-    from sliplab.protocols import Trial
+    from sliplab.protocols import PlannedTrial
     from sliplab.protocols.program import Step
 else:
     cv2 = Later("cv2")
@@ -112,7 +112,7 @@ class LiveFeed:
         self._over = threading.Event()
 
     def begin(
-        self, trial: Trial, attempt: int, sink: Sink, event_px: tuple[int, int] | None
+        self, trial: PlannedTrial, attempt: int, sink: Sink, event_px: tuple[int, int] | None
     ) -> Sink:
         """Note the trial that begins, and return the sink of its streams.
 

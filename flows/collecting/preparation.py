@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sliplab.protocols import Plan, Task, Trial
+from sliplab.protocols import Plan, PlannedTrial, Task
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, TouchedZero
@@ -14,8 +14,8 @@ def ask(rig: Rig, task: Task) -> None:
         raise RigError("operator", f"'{task.prompt}' was not confirmed")
 
 
-def change_over(rig: Rig, plan: Plan, before: Trial | None, trial: Trial) -> None:
-    """Have everything changed that differs between two trials; a plate that hangs there stays.
+def change_over(rig: Rig, plan: Plan, before: PlannedTrial | None, trial: PlannedTrial) -> None:
+    """Ask for each change between two trials; a plate that is already mounted stays.
 
     Raises:
         RigError: a change was not confirmed, or the rig detects another plate.
@@ -29,13 +29,13 @@ def change_over(rig: Rig, plan: Plan, before: Trial | None, trial: Trial) -> Non
                 raise RigError("plate", f"{task.prompt}: the rig detects another mass")
 
 
-def _mounted(rig: Rig, plan: Plan, trial: Trial) -> bool:
+def _mounted(rig: Rig, plan: Plan, trial: PlannedTrial) -> bool:
     """Check that the plate that the trial needs hangs on the slider, to a gram."""
     mass = plan.mass_kg(trial)
     return mass is None or rig.plate is None or abs(rig.plate.mass_kg() - mass) < 1e-3
 
 
-def find_zero(rig: Rig, plan: Plan, trial: Trial) -> TouchedZero | None:
+def find_zero(rig: Rig, plan: Plan, trial: PlannedTrial) -> TouchedZero | None:
     """Find the depth zero that a trial relies on; None where the protocol asks for none.
 
     Raises:

@@ -23,11 +23,11 @@ from uuid import UUID
 from sliplab.flows.collecting.supervisor import SessionListener
 from sliplab.flows.planning.run_request import CampaignCounts, RunRequest
 from sliplab.flows.running import console, orchestration, stopping
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.shown import plural
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0
@@ -57,7 +57,7 @@ class Remaining:
     def __init__(
         self,
         plan: Plan,
-        trials: Sequence[Trial],
+        trials: Sequence[PlannedTrial],
         *,
         real_time: bool,
         clock: Callable[[], float] = time.monotonic,
@@ -67,11 +67,11 @@ class Remaining:
         self._planned_done = 0.0
         self._began = clock()
 
-    def add(self, trials: Sequence[Trial]) -> None:
+    def add(self, trials: Sequence[PlannedTrial]) -> None:
         """Add trials to take."""
         self._left += sum(self._plan.seconds(trial) for trial in trials)
 
-    def done(self, trial: Trial) -> None:
+    def done(self, trial: PlannedTrial) -> None:
         """Note that a trial is over, whatever its outcome."""
         self._left -= self._plan.seconds(trial)
         self._planned_done += self._plan.seconds(trial)
@@ -117,7 +117,7 @@ class CollectionProgress(SessionListener):
         self._left: Remaining
 
     @contextmanager
-    def begin(self, trials: Sequence[Trial]) -> Iterator[None]:
+    def begin(self, trials: Sequence[PlannedTrial]) -> Iterator[None]:
         """Show the progress of taking `trials` while the block runs."""
         rig = self._run_request.rig
         self._total = len(trials)
@@ -136,14 +136,14 @@ class CollectionProgress(SessionListener):
     def _log(self, line: str) -> None:
         self.lines.append((datetime.now(UTC), line))
 
-    def add(self, trials: Sequence[Trial]) -> None:
+    def add(self, trials: Sequence[PlannedTrial]) -> None:
         """Add trials that are to be taken as well."""
         with self._lock:
             self._total += len(trials)
         self._left.add(trials)
         self._bar.extend(len(trials))
 
-    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+    def on_trial_done(self, trial: PlannedTrial, outcome: str) -> None:
         """Count a trial that is over.
 
         Raises:
@@ -295,7 +295,7 @@ class _Page:
     def _report_table(self, client: Any) -> None:
         import json
 
-        campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
+        campaign = TrialStore(self._run_request.store).campaign(self._run_request.campaign)
         rows = outcome_rows(self._run_request.counts(campaign), self.progress.outcomes)
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
@@ -310,7 +310,7 @@ class _Page:
 
     def _rates(self) -> tuple[list[int], list[float]]:
         """Return plan numbers from 1, and events per second, of evenly spread trials."""
-        campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
+        campaign = TrialStore(self._run_request.store).campaign(self._run_request.campaign)
         there = campaign.committed()
         taken = [(n, t) for n, t in enumerate(self._run_request.plan, 1) if t.id in there]
         numbers, rates = [], []

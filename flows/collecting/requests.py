@@ -27,7 +27,7 @@ from sliplab.storage.trials import control
 from sliplab.storage.trials.control import ControlRequest, Kind
 from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
 from sliplab.storage.trials.migrate import migrate
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 POLL_S = 0.2
 
@@ -37,7 +37,7 @@ class CampaignStopped(RuntimeError):
 
 
 @contextmanager
-def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iterator[None]:
+def store_lock(store: TrialStore, *, brief: bool = False, collects: str = "") -> Iterator[None]:
     """Hold the store's lock for writing while the block runs; the store has the newest format then.
 
     Args:
@@ -58,7 +58,7 @@ def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iter
 
 
 @uninterrupted
-def carry_out(store: Store, running: bool = False) -> list[tuple[ControlRequest, Json]]:
+def carry_out(store: TrialStore, running: bool = False) -> list[tuple[ControlRequest, Json]]:
     """Carry out all open requests; the caller holds the store's lock.
 
     Args:
@@ -87,7 +87,7 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[ControlRequest,
     return done
 
 
-def refuse_paused(store: Store) -> None:
+def refuse_paused(store: TrialStore) -> None:
     """Refuse to begin a collection whose store is paused; it would pause at once.
 
     Raises:
@@ -151,7 +151,7 @@ class RequestOutcome:
 
 
 def ask(
-    store: Store,
+    store: TrialStore,
     kind: Kind,
     *,
     who: str = "",
@@ -173,7 +173,7 @@ def ask(
 
 
 def stop_collection(
-    store: Store, *, who: str = "", why: str = "", limit_s: float = 60.0
+    store: TrialStore, *, who: str = "", why: str = "", limit_s: float = 60.0
 ) -> RequestOutcome:
     """Stop the collection that runs on the store, the arm first, and wait until it has ended.
 
@@ -184,7 +184,7 @@ def stop_collection(
 
 
 def note_stop(
-    store: Store,
+    store: TrialStore,
     holder: Json | None,
     reached: bool,
     *,
@@ -214,7 +214,7 @@ def note_stop(
 
 
 def known_trials(
-    store: Store, names: list[str] | None, trials: list[str]
+    store: TrialStore, names: list[str] | None, trials: list[str]
 ) -> dict[str, tuple[str, ...]]:
     """Return the trials by campaign.
 
@@ -245,7 +245,7 @@ def known_trials(
     return {name: tuple(ids) for name, ids in found.items()}
 
 
-def _carry_out_if_free(store: Store) -> Json | None:
+def _carry_out_if_free(store: TrialStore) -> Json | None:
     """Carry out open requests if the store is not locked; else return the holder of its lock."""
     with ExitStack() as lock:
         try:
@@ -256,7 +256,7 @@ def _carry_out_if_free(store: Store) -> Json | None:
     return None
 
 
-def _wait(store: Store, title: str, limit_s: float, made: ControlRequest | None) -> None:
+def _wait(store: TrialStore, title: str, limit_s: float, made: ControlRequest | None) -> None:
     """Wait until the request is answered or the store's lock is free; `limit_s` at most.
 
     Raises:

@@ -27,7 +27,7 @@ from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSuperviso
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.program import ACTING, Step
@@ -54,24 +54,25 @@ from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.context import SKIN, LoggedContext, unplanned
 from sliplab.storage.trials.recovery import recover
 from sliplab.storage.trials.registration import registration_files
-from sliplab.storage.trials.store import Campaign, SessionRecord, Store
+from sliplab.storage.trials.store import Campaign, SessionRecord, TrialStore
 from sliplab.storage.trials.writer import TrialWriter
 from sliplab.storage.versions import RECORDING, installed_versions
 
+# an attempt is written without interruption, but a signal stops its motion at once
 interruptible(Rig.run_trial)
 
 
-def _ignore(trial: Trial) -> None:
+def _ignore(trial: PlannedTrial) -> None:
     """Take no note of a trial that was committed."""
 
 
 class Rounds(Protocol):
     """Decides between two rounds of trials which are next: what the hook `more_trials` opens."""
 
-    def next_trials(self) -> list[Trial]:
+    def next_trials(self) -> list[PlannedTrial]:
         """Return the trials to take next; none at the end."""
 
-    def committed(self, trial: Trial) -> None:
+    def committed(self, trial: PlannedTrial) -> None:
         """Take note of a trial that was just committed."""
 
 
@@ -87,11 +88,11 @@ class CollectionSession:
 
     collector: TrialCollector
     supervisor: CollectionSupervisor
-    trials: list[Trial]
+    trials: list[PlannedTrial]
     left_out: int = 0
     rounds: Rounds | None = None
 
-    def more(self) -> list[Trial]:
+    def more(self) -> list[PlannedTrial]:
         """Return the trials to take after all others: requested retakes, or the next round."""
         return self.supervisor.more() or ([] if self.rounds is None else self.rounds.next_trials())
 
@@ -107,7 +108,7 @@ def open_session(
         StoreError: its disk is full, read-only or failing.
         CampaignStopped: reference trials had drifted.
     """
-    store = Store.create(run_request.store)
+    store = TrialStore.create(run_request.store)
     with store_lock(store, collects=run_request.campaign):
         campaign = _recover(store, run_request)
         supervisor = CollectionSupervisor(run_request, store, campaign, listener=listener)
@@ -146,7 +147,7 @@ def open_session(
 
 @contextmanager
 def _opened_rounds(
-    run_request: RunRequest, store: Store, campaign: Campaign
+    run_request: RunRequest, store: TrialStore, campaign: Campaign
 ) -> Iterator[Rounds | None]:
     if not run_request.has_claims:
         yield None
@@ -160,7 +161,7 @@ def refresh(run_request: RunRequest) -> Campaign:
 
     Claims are evaluated, too: a collection may have ended right after its last trial.
     """
-    store = Store.create(run_request.store)
+    store = TrialStore.create(run_request.store)
     with store_lock(store):
         campaign = _recover(store, run_request)
         with _opened_rounds(run_request, store, campaign) as rounds:
@@ -169,7 +170,7 @@ def refresh(run_request: RunRequest) -> Campaign:
         return campaign
 
 
-def _recover(store: Store, run_request: RunRequest) -> Campaign:
+def _recover(store: TrialStore, run_request: RunRequest) -> Campaign:
     """Clean up after a crash, and carry out open requests."""
     clean_up(store)
     campaign = describe_campaign(store, run_request)
@@ -179,7 +180,7 @@ def _recover(store: Store, run_request: RunRequest) -> Campaign:
     return campaign
 
 
-def clean_up(store: Store) -> None:
+def clean_up(store: TrialStore) -> None:
     """Delete the temporary files that killed programs left outside the campaigns."""
     sweep_temporary(store.folder)
     sweep_temporary(store.folder / control.FOLDER)
@@ -240,21 +241,21 @@ class TrialCollector:
     rig: Rig
     campaign: Campaign
     operator: str = ""
-    on_trial: Callable[[Trial, str], None] = NO_LISTENER.on_trial_done
-    on_commit: Callable[[Trial], None] = _ignore
+    on_trial: Callable[[PlannedTrial, str], None] = NO_LISTENER.on_trial_done
+    on_commit: Callable[[PlannedTrial], None] = _ignore
     supervisor: CollectionSupervisor | None = None
     context: Callable[[], dict[str, str]] = dict
     feed: LiveFeed | None = None
     taken: int = 0
     retaken: int = 0
-    _previous: Trial | None = None
+    _previous: PlannedTrial | None = None
     _warm: bool = False
     _zero_slot: int | None = None
     _zero_sd_mm: float | None = None
     _logged: dict[str, str] = field(default_factory=dict)
     """Context of the attempt."""
 
-    def take(self, trials: list[Trial]) -> None:
+    def take(self, trials: list[PlannedTrial]) -> None:
         """Take `trials`, and do before each what the protocol asks for.
 
         Raises:
@@ -275,7 +276,7 @@ class TrialCollector:
         """Forget all preparations: after a pause, plate, skin and depth zero may have changed."""
         self._previous, self._warm, self._zero_slot = None, False, None
 
-    def _may_take(self, trial: Trial) -> bool:
+    def _may_take(self, trial: PlannedTrial) -> bool:
         may = self.supervisor is None or self.supervisor.may_take(trial)
         if self.supervisor is not None and self.supervisor.was_paused():
             self.fresh_start()
@@ -286,14 +287,14 @@ class TrialCollector:
             self.on_trial(trial, "skipped")
         return may
 
-    def _finish(self, trial: Trial, outcome: str) -> None:
+    def _finish(self, trial: PlannedTrial, outcome: str) -> None:
         if outcome == "committed":
             self.on_commit(trial)
         self.on_trial(trial, outcome)
         if self.supervisor is not None:
             self.supervisor.after(trial, outcome)
 
-    def _prepare(self, trial: Trial) -> None:
+    def _prepare(self, trial: PlannedTrial) -> None:
         """Do what the protocol asks for before this trial and this session has not done yet."""
         change_over(self.rig, self.plan, self._previous, trial)
         for task in self.plan.tasks_before(trial):
@@ -301,7 +302,7 @@ class TrialCollector:
                 ask(self.rig, task)
         self._warm_and_zero(trial)
 
-    def _warm_and_zero(self, trial: Trial) -> None:
+    def _warm_and_zero(self, trial: PlannedTrial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
         maintenance = self.plan.protocol.collection.maintenance
         if maintenance.warm_up is not None and not self._warm:
@@ -319,7 +320,7 @@ class TrialCollector:
                 zero = find_zero(self.rig, self.plan, trial)
                 self._zero_slot, self._zero_sd_mm = slot, None if zero is None else zero.sd_mm
 
-    def _take_with_retakes(self, trial: Trial) -> None:
+    def _take_with_retakes(self, trial: PlannedTrial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
         retakes = self.plan.protocol.collection.gates.retakes
         number = self.campaign.attempts().get(trial.id, 0)
@@ -339,7 +340,7 @@ class TrialCollector:
         self._finish(trial, "committed")
 
     @uninterrupted
-    def _attempt(self, trial: Trial, number: int) -> bool:
+    def _attempt(self, trial: PlannedTrial, number: int) -> bool:
         """Record one attempt at a trial; commit it, or quarantine it if it fails a gate.
 
         A signal stops the motion at once. One that comes before or after it waits: nothing moves
@@ -390,7 +391,7 @@ class TrialCollector:
         return found.passed
 
     def _watched(
-        self, trial: Trial, number: int, writer: TrialWriter
+        self, trial: PlannedTrial, number: int, writer: TrialWriter
     ) -> tuple[Sink, Callable[[Step], None]]:
         """Return the sink of an attempt, and what is called with each of its steps."""
         if self.feed is None:
@@ -413,7 +414,7 @@ class TrialCollector:
 
     def _record(
         self,
-        trial: Trial,
+        trial: PlannedTrial,
         attempt: int,
         run: TrialRun,
         found: Assessment,

@@ -12,11 +12,11 @@ from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console, stopping
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import ControlRequest
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 PAUSE_LIMIT_S = 12 * 3600.0
 POLL_S = 0.5
@@ -30,7 +30,7 @@ class WindowOver(CampaignStopped):
 class SessionListener:
     """Follows a session, such as a progress display; this one does nothing."""
 
-    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+    def on_trial_done(self, trial: PlannedTrial, outcome: str) -> None:
         """Take note of a trial that is ``committed``, ``set aside`` or ``skipped``."""
 
     def on_paused(self, why: str) -> None:
@@ -58,7 +58,7 @@ class CollectionSupervisor:
     def __init__(
         self,
         run_request: RunRequest,
-        store: Store,
+        store: TrialStore,
         campaign: Campaign,
         disk: DiskWatch | None = None,
         listener: SessionListener = NO_LISTENER,
@@ -83,7 +83,7 @@ class CollectionSupervisor:
         """
         self._references.begin()
 
-    def may_take(self, trial: Trial) -> bool:
+    def may_take(self, trial: PlannedTrial) -> bool:
         """Return whether to take `trial` now; waits while the store is paused.
 
         Raises:
@@ -104,7 +104,7 @@ class CollectionSupervisor:
         found, self._was_paused = self._was_paused, False
         return found
 
-    def after(self, trial: Trial, outcome: str) -> None:
+    def after(self, trial: PlannedTrial, outcome: str) -> None:
         """Update the disk estimate and the drift check after a trial.
 
         Raises:
@@ -114,7 +114,7 @@ class CollectionSupervisor:
             self.disk.learn(trial)
             self._references.look(trial)
 
-    def more(self) -> list[Trial]:
+    def more(self) -> list[PlannedTrial]:
         """Return pending trials that were requested again in the meantime, in the plan's order."""
         self._process_requests()
         retakes, self._retakes = self._retakes, set()
@@ -147,7 +147,7 @@ class CollectionSupervisor:
         for trial, did in answer["did"].get("trials", {}).items():
             console.say(f"{request.kind} {trial}: {did}")
 
-    def _check_window(self, trial: Trial) -> None:
+    def _check_window(self, trial: PlannedTrial) -> None:
         """Check that the trial's planned time fits: the arm must rest while people are present."""
         until = self._run_request.until
         if until is None:
@@ -161,7 +161,7 @@ class CollectionSupervisor:
                 f"{trial.id}; the next collection continues"
             )
 
-    def _wait_while_paused(self, trial: Trial) -> None:
+    def _wait_while_paused(self, trial: PlannedTrial) -> None:
         """Wait until the pause is over."""
         why = f"paused before {trial.id} ({self._paused})"
         console.say(f"{why}; `sliplab resume {self._store.folder}` continues it")

@@ -15,12 +15,12 @@ from sliplab.analysis.references import (
 )
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.planning.disk_space import RESERVE
-from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.planning.size_estimate import trial_bytes
 from sliplab.flows.running.console import size
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.storage.trials.context import SKIN, LoggedContext
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 _LOOK_BACK = 50
 """Committed trials from which a session estimates sizes when it begins."""
@@ -57,24 +57,24 @@ class DiskWatch:
         for trial in [item for item in run_request.plan if item.id in there][-_LOOK_BACK:]:
             self.learn(trial)
 
-    def learn(self, trial: Trial) -> None:
+    def learn(self, trial: PlannedTrial) -> None:
         """Update the ratio by the size of a trial that was just committed."""
         folder = self._campaign.folder / "trials" / trial.id
         took = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
         ratio = took / max(trial_bytes(self._run_request.rig, self._run_request.plan, trial), 1.0)
         self._ratio = max(ratio, self._ratio or 0.0)
 
-    def needs(self, trial: Trial) -> float:
+    def needs(self, trial: PlannedTrial) -> float:
         """Return the bytes that a trial takes while it is written."""
         rig, plan = self._run_request.rig, self._run_request.plan
-        retained = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
+        stored = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
         frame = rig.frame_px(plan)
         if not rig.frame_camera.spool or frame is None:
-            return retained
+            return stored
         rate = rig.frame_rate_hz(plan)
-        return retained + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
+        return stored + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
 
-    def check(self, trial: Trial) -> None:
+    def check(self, trial: PlannedTrial) -> None:
         """Check that the next trial fits.
 
         Raises:
@@ -109,14 +109,14 @@ class ReferenceWatch:
         """
         if self._gate is None:
             return
-        logged = LoggedContext(Store(self._run_request.store), self._campaign.name).read()
+        logged = LoggedContext(TrialStore(self._run_request.store), self._campaign.name).read()
         skin = logged.get(SKIN, self._run_request.rig.skin.serial)
         known = reference_trials(self._run_request.plan, self._campaign.committed())
         known = of_skin(self._campaign, known, skin)
         for trial in dict.fromkeys([*known[:1], *known[-1:]]):
             self.look(trial)
 
-    def look(self, trial: Trial) -> None:
+    def look(self, trial: PlannedTrial) -> None:
         """Check a trial that was just committed, if it is a reference trial.
 
         Raises:

@@ -14,7 +14,7 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.detector_process import PATIENT_S
 from sliplab.flows.detecting.sink import Timeouts
 from sliplab.flows.detecting.sources import NamedSource, NetworkSource, Source
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.program import ACTING, Move, Program
 from sliplab.protocols.settings import AnalysisSettings
@@ -48,7 +48,7 @@ class DetectRequest:
     rig: RigFile
     source: Source
     plan: Plan | None = None
-    trial: Trial | None = None
+    trial: PlannedTrial | None = None
     reflex: Reflex | None = None
     safe: Reflex | None = None
     seconds: float | None = None
@@ -192,7 +192,7 @@ def load_model(path: Path) -> Fitted:
         raise InputError(path, "", None, text) from None
 
 
-def choose_trial(plan: Plan, condition: str | None) -> Trial:
+def choose_trial(plan: Plan, condition: str | None) -> PlannedTrial:
     """Find the first trial of a condition, which may omit the repetition and single levels.
 
     Args:
@@ -216,7 +216,7 @@ def choose_trial(plan: Plan, condition: str | None) -> Trial:
     raise InputError("--trial", "", condition, f"{what}: {'; '.join(names)}{more}")
 
 
-def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: float) -> Reflex:
+def make_reflex(text: str, file: RigFile, plan: Plan, trial: PlannedTrial, hold_s: float) -> Reflex:
     """Parse ``stop``, ``press:MM`` or ``grip:MM``, and check it against protocol and rig.
 
     Raises:

@@ -105,7 +105,7 @@ class DetectNumbers(TypedDict):
         onsets: the first decision of each kind of slip.
         latency_ms: from a window's last event to its decision.
         compute_ms: from the read of the events to the decision.
-        losses: as `analysis.detectors.live.Losses`.
+        losses: as `analysis.detectors.live.StreamFaults`.
         promise: what became of the promise of false alarms; None without one.
     """
 

@@ -17,7 +17,7 @@ from sliplab.protocols.shown import one_of, plural
 from sliplab.protocols.windows import Windows
 from sliplab.storage.errors import NoTrial
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +37,7 @@ def classes_of(windows: pd.DataFrame) -> I64:
 
 
 def _by_trial(
-    store: Store, windows: pd.DataFrame, length_ns: int
+    store: TrialStore, windows: pd.DataFrame, length_ns: int
 ) -> dict[tuple[str, str], tuple[Recording, I64]]:
     """Return each trial's recording, and its rows in `windows`.
 
@@ -83,7 +83,7 @@ def _by_trial(
     return found
 
 
-def event_counts(store: Store, windows: pd.DataFrame, shape: Windows) -> SparseWindows:
+def event_counts(store: TrialStore, windows: pd.DataFrame, shape: Windows) -> SparseWindows:
     """Return the event counts of windows, in the table's order.
 
     Args:
@@ -117,7 +117,7 @@ class EventDataset:
 
     def __init__(
         self,
-        store: Store,
+        store: TrialStore,
         windows: pd.DataFrame,
         length_ns: int,
         transform: Callable[[Any], Any] | None = None,

@@ -18,7 +18,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store as TrialStore
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     import xarray

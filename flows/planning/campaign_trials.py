@@ -11,13 +11,13 @@ from typing import TypedDict
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console
-from sliplab.protocols import InputError, Plan, Trial
+from sliplab.protocols import InputError, Plan, PlannedTrial
 from sliplab.protocols.shown import plural
 from sliplab.storage.trials.control import skipped
-from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, StoreError, TrialStore
 
 
-def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
+def pending_trials(plan: Plan, campaign: Campaign) -> list[PlannedTrial]:
     """Return trials that are neither committed nor excluded, in the plan's order."""
     done = campaign.committed() | skipped(campaign).keys()
     failed = campaign.failed_attempts()
@@ -86,7 +86,7 @@ def excluded_trials(
 
 
 def all_excluded(
-    store: Store, unreadable: list[str], committed: dict[str, set[str]] | None = None
+    store: TrialStore, unreadable: list[str], committed: dict[str, set[str]] | None = None
 ) -> list[StoreExcludedTrial]:
     """List the excluded trials of all campaigns.
 

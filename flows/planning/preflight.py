@@ -25,7 +25,7 @@ from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.rigs.twin import warnings
 from sliplab.storage.trials.context import SKIN, LoggedContext
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.analysis.clocks.synchronise import DeviceSync
@@ -58,7 +58,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         InputError: protocol or rig file cannot be used at all.
     """
     run_request = make_request(protocol, rig, store, enable=enable)
-    pending = pending_trials(run_request.plan, Store(store).campaign(run_request.campaign))
+    pending = pending_trials(run_request.plan, TrialStore(store).campaign(run_request.campaign))
     found = [
         PreflightCheck(
             "protocol and limits",
@@ -131,9 +131,9 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[PreflightChec
 
 def _check_skin(run_request: RunRequest) -> list[PreflightCheck]:
     """Name what belongs to another skin than the one that was logged for the campaign."""
-    if not Store.exists(run_request.store):
+    if not TrialStore.exists(run_request.store):
         return []
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     campaign = store.campaign(run_request.campaign)
     logged = LoggedContext(store, campaign.name)
     if SKIN not in logged.read() or (change := logged.last()) is None:

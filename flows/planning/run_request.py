@@ -16,9 +16,9 @@ from sliplab.flows.planning.campaign_trials import (
     pending_trials,
 )
 from sliplab.flows.planning.disk_space import check_space
-from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.planning.parameters import NO_METADATA, SessionMetadata
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.flows.planning.size_estimate import plan_bytes
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.claims import section_hash
 from sliplab.protocols.differences import comparable_collection, format_differences
 from sliplab.protocols.key_errors import KeyedError
@@ -35,7 +35,7 @@ from sliplab.rigs.physics_levels import levels_of, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
 from sliplab.storage.trials.context import SKIN, LoggedContext
-from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, StoreError, TrialStore
 
 Claims = Literal["use", "overrule", "ignore"]
 """`overrule`: claims are evaluated and do not end the campaign."""
@@ -86,7 +86,7 @@ class RunRequest:
     claims: Claims = "use"
     judging_model: Path | None = None
 
-    def due_trials(self, campaign: Campaign) -> list[Trial]:
+    def due_trials(self, campaign: Campaign) -> list[PlannedTrial]:
         """Return the trials to take now, in the plan's order."""
         pending = pending_trials(self.plan, campaign)
         if (begun := self._begun(campaign)) is not None:
@@ -174,8 +174,8 @@ def make_request(
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
     begun = None
-    if Store.exists(store):
-        found = Store.open(store).campaign(name)
+    if TrialStore.exists(store):
+        found = TrialStore.open(store).campaign(name)
         begun = found if found.begun else None
     # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
@@ -199,7 +199,7 @@ def make_request(
     )
     if begun:
         _check_same(run_request, begun)
-    elif not rig_file.simulated and Store.exists(store):
+    elif not rig_file.simulated and TrialStore.exists(store):
         _check_skin(run_request, rig)
     return run_request
 
@@ -230,7 +230,7 @@ def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
             "analysis, levels or repetitions is fine, anything else would mix two experiments. "
             f"Give the new one its own name with --campaign.{_changed(run_request, campaign)}"
         )
-    logged = LoggedContext(Store(run_request.store), campaign.name).read().get(SKIN)
+    logged = LoggedContext(TrialStore(run_request.store), campaign.name).read().get(SKIN)
     begun_on = read_text(campaign.folder / "rig.yaml", "rig file")
     if info["rig_hash"] != rig_hash(run_request.rig_text) and not same_rig(
         begun_on, run_request.rig_text, skin=logged
@@ -259,7 +259,7 @@ def _check_skin(run_request: RunRequest, file: Path) -> None:
     Raises:
         InputError: the log of the store says so.
     """
-    store, serial = Store.open(run_request.store), run_request.rig.skin.serial
+    store, serial = TrialStore.open(run_request.store), run_request.rig.skin.serial
     for campaign in store.campaigns():
         if campaign.info.get("rig") != run_request.rig.name:
             continue
@@ -290,7 +290,7 @@ def _rig_changed(run_request: RunRequest, campaign: Campaign) -> str:
     return f" What changed:{changes}" if changes else ""
 
 
-def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
+def describe_campaign(store: TrialStore, run_request: RunRequest) -> Campaign:
     """Write the campaign's description; the protocol's analysis and levels may have changed."""
     campaign = store.campaign(run_request.campaign)
     levels = levels_of(run_request.rig)
@@ -313,7 +313,7 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
 
 def missing_bytes(run_request: RunRequest) -> float:
     """Return the bytes that the trials still to collect are expected to need."""
-    pending = run_request.due_trials(Store(run_request.store).campaign(run_request.campaign))
+    pending = run_request.due_trials(TrialStore(run_request.store).campaign(run_request.campaign))
     done = {trial.id for trial in run_request.plan} - {trial.id for trial in pending}
     return plan_bytes(run_request.rig, run_request.plan, done)
 

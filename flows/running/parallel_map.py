@@ -33,7 +33,7 @@ from sliplab.storage.spawn_context import WORKERS, check_work
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -172,7 +172,7 @@ class TrialJob:
     settings: Any
 
 
-def trial_job(store: Store, work: TrialWork, make: Make) -> TrialJob:
+def trial_job(store: TrialStore, work: TrialWork, make: Make) -> TrialJob:
     """Return some work as another process can do it, by `make_in_process`."""
     recording = work.recording
     return TrialJob(
@@ -187,7 +187,7 @@ def trial_job(store: Store, work: TrialWork, make: Make) -> TrialJob:
 
 
 def run_trials(
-    store: Store,
+    store: TrialStore,
     step: str,
     title: str,
     work: list[TrialWork],
@@ -206,7 +206,7 @@ def run_trials(
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
 def _trials_flow(
-    store: Store,
+    store: TrialStore,
     step: str,
     title: str,
     work: list[TrialWork],
@@ -219,7 +219,7 @@ def _trials_flow(
 
 
 def keep_trials(
-    store: Store,
+    store: TrialStore,
     step: str,
     title: str,
     work: list[TrialWork],
@@ -241,7 +241,7 @@ def keep_trials(
 
 
 def each_trial(
-    store: Store,
+    store: TrialStore,
     title: str,
     work: Sequence[TrialWork],
     make: Make,

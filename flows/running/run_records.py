@@ -29,7 +29,7 @@ from sliplab.storage.files import (
 from sliplab.storage.process import is_here, named, now, this_process
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.control import FOLDER
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 EMBEDDED = "embedded"
 _ID = r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"
@@ -197,18 +197,18 @@ def _folder(store: Path) -> Path:
     return store / FOLDER / "runs"
 
 
-def _timing_file(store: Store) -> Path:
+def _timing_file(store: TrialStore) -> Path:
     return store.folder / "derived" / "timing.json"
 
 
-def step_seconds(store: Store) -> dict[str, float]:
+def step_seconds(store: TrialStore) -> dict[str, float]:
     """Wall seconds by step, of the last run that had something to do."""
     path = _timing_file(store)
     return {key: float(value) for key, value in read_json(path).items()} if path.exists() else {}
 
 
 @contextmanager
-def timed(store: Store, step: str) -> Iterator[None]:
+def timed(store: TrialStore, step: str) -> Iterator[None]:
     """Keep the wall seconds of the block under `step` if it ends well."""
     start = time.perf_counter()
     yield

@@ -6,7 +6,9 @@ the handler also raises a flag: the rig looks at it in every poll, progress bars
 traceback that Python prints of a dropped exception is suppressed, since the flag is set.
 
 While files are written that belong together, only the flag is raised, and the exception when they
-are complete (`sliplab.storage.interrupts`).
+are complete (`sliplab.storage.interrupts`); the third signal ends that if 10 s have passed. While
+the arm stops, further signals are ignored up to ten times (`rigs.core.rig`); while the last message
+is printed, they are ignored (`flows.__main__`).
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.process import now
 from sliplab.storage.schema.trial import DeviceRecord, Given, GivenSpan, MotionStep
 from sliplab.storage.streams import Chunk, Json
-from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, Store
+from sliplab.storage.trials.store import ADAPTER, IMPORTED, Campaign, CampaignInfo, TrialStore
 
 GIVEN, UNKNOWN = "given", "unknown"
 """Grades of clocks: stated by the adapter, or not."""
@@ -61,7 +61,7 @@ T = TypeVar("T")
 
 
 def import_adapted(
-    store: Store,
+    store: TrialStore,
     name: str,
     found: AdaptedSet,
     text: str,

@@ -15,7 +15,7 @@ from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.yaml_file import read_text
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def import_adapted(
@@ -60,7 +60,9 @@ def import_adapted(
 
 def _planned(found: AdaptedSet, parts: dict[str, str], place: Path, name: str) -> list[Json]:
     """Return what would be imported, a row a trial."""
-    existing = Store.open(place).campaign(name).committed() if Store.exists(place) else set()
+    existing = (
+        TrialStore.open(place).campaign(name).committed() if TrialStore.exists(place) else set()
+    )
     return [
         {
             "trial": trial.id,

@@ -16,7 +16,7 @@ from sliplab.protocols.adapter import Adapter
 from sliplab.protocols.adapter_parts import BUILT_IN, OWN_FORMATS, FieldRule
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.file_pattern import FilePattern, fill, parse_pattern, template_fields
-from sliplab.protocols.recorded import RecordedTrial, natural, split_recorded
+from sliplab.protocols.recorded import TrialProperties, natural, split_recorded
 from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import Skipped
@@ -50,11 +50,11 @@ class AdaptedTrial:
     label: FoundLabel | None
     missing: tuple[str, ...] = ()
 
-    def recorded(self) -> RecordedTrial:
+    def recorded(self) -> TrialProperties:
         """Properties that the split needs; the recording's length is not known yet."""
         names = () if self.label is None else self.label.classes
         first = names[0] if names else None
-        return RecordedTrial(self.id, self.condition, self.fields, first, 0.0, names)
+        return TrialProperties(self.id, self.condition, self.fields, first, 0.0, names)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class AdaptedSet:
     skipped: tuple[Skipped, ...]
     warnings: tuple[str, ...]
 
-    def parts(self, others: Iterable[RecordedTrial] = ()) -> dict[str, str]:
+    def parts(self, others: Iterable[TrialProperties] = ()) -> dict[str, str]:
         """Return the part of the split of each trial by id, of `others` that are there as well.
 
         Raises:

@@ -29,13 +29,13 @@ def alerts(
     from datetime import datetime
 
     from sliplab.flows.running import stopping
-    from sliplab.plugins.alerts.outbox import Target
     from sliplab.plugins.alerts.settings import load_alerts
-    from sliplab.plugins.alerts.watcher import POLL_S, AlertWatcher, AppriseTarget
+    from sliplab.plugins.alerts.targets import AppriseTarget, Target
+    from sliplab.plugins.alerts.watcher import POLL_S, AlertWatcher
     from sliplab.storage.trials.lock import exclusive
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened, settings = Store.open(store), load_alerts(file)
+    opened, settings = TrialStore.open(store), load_alerts(file)
     targets: list[Target] = [AppriseTarget(address) for address in settings.to]
     if test:
         taken = {

@@ -20,7 +20,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
-from sliplab.storage.trials.store import FORGIVEN, IMPORTED, QuarantineEntry, Store
+from sliplab.storage.trials.store import FORGIVEN, IMPORTED, QuarantineEntry, TrialStore
 
 FAILED = {"FAILED", "CRASHED"}
 GRADES = (
@@ -56,7 +56,7 @@ class Event:
 
 
 def events(
-    store: Store, state: StoreStatus, settings: AlertSettings, now: datetime
+    store: TrialStore, state: StoreStatus, settings: AlertSettings, now: datetime
 ) -> Iterator[Event]:
     """Yield all that holds now or is on record, each with the key by which it is reported once."""
     for found in _events(store, state, settings, now):
@@ -65,7 +65,7 @@ def events(
 
 
 def _events(
-    store: Store, state: StoreStatus, settings: AlertSettings, now: datetime
+    store: TrialStore, state: StoreStatus, settings: AlertSettings, now: datetime
 ) -> Iterator[Event]:
     yield from _failed_runs(store, now)
     yield from _long_pause(store, settings, now)
@@ -79,7 +79,7 @@ def _events(
         yield from _grades(store, campaign.name)
 
 
-def _failed_runs(store: Store, now: datetime) -> Iterator[Event]:
+def _failed_runs(store: TrialStore, now: datetime) -> Iterator[Event]:
     for run, ended in run_records.runs(store.folder):
         name = " of ".join(filter(None, [run["flow"], run.get("deployment")]))
         if ended is None:
@@ -91,7 +91,7 @@ def _failed_runs(store: Store, now: datetime) -> Iterator[Event]:
             yield Event(f"run {run['run']}", "run failed", text, since)
 
 
-def _long_pause(store: Store, settings: AlertSettings, now: datetime) -> Iterator[Event]:
+def _long_pause(store: TrialStore, settings: AlertSettings, now: datetime) -> Iterator[Event]:
     paused = control.paused(store)
     if paused is None:
         return
@@ -152,7 +152,7 @@ def _set_aside(
             yield Event(f"aside {campaign} {trial} {len(causes)}", "trial set aside", text, now)
 
 
-def _grades(store: Store, campaign: str) -> Iterator[Event]:
+def _grades(store: TrialStore, campaign: str) -> Iterator[Event]:
     """Compare the clocks of each of the last committed trials with those of the one before."""
     folders = {path: path.stat().st_mtime_ns for path in store.campaign(campaign).folders("trials")}
     known = sorted(folders, key=lambda path: (folders[path], path.name))[-LOOK_BACK:]

@@ -18,28 +18,18 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from sliplab.plugins.alerts.conditions import Event
+from sliplab.plugins.alerts.targets import Target
 from sliplab.storage.files import inside, make_folder, read_json, write_json, write_new_json
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 FOLDER, BEGAN = "alerts", "began.json"
 EVER = datetime.min.replace(tzinfo=UTC)
 FIRST_RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
 WAIT_S = 1.0
 """Longest wait for the targets' answers, s; later ones are found at the next look."""
-
-
-class Target(Protocol):
-    """Sends to one address."""
-
-    name: str
-    """The address without its secrets."""
-
-    def send(self, title: str, text: str) -> bool:
-        """Return whether the message was taken."""
 
 
 class _Message(threading.Thread):
@@ -83,7 +73,7 @@ class Outbox:
 
     def __init__(
         self,
-        store: Store,
+        store: TrialStore,
         targets: Sequence[Target],
         most_per_hour: int,
         now: datetime,

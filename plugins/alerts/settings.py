@@ -8,22 +8,18 @@ alerts:
 
 from __future__ import annotations
 
-import os
-import re
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 from zoneinfo import ZoneInfo
 
 from pydantic import AfterValidator, Field
 
 from sliplab.flows.planning.clock_times import From, Zone
+from sliplab.plugins.alerts.targets import expanded, make_sender
 from sliplab.protocols import InputError
 from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import StrictModel, parse_leniently, read_text, validate
-
-if TYPE_CHECKING:
-    from apprise import NotifyBase
 
 KINDS = (
     "run failed",
@@ -36,7 +32,6 @@ KINDS = (
     "campaign done",
 )
 """What a message may be about."""
-_NAME = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
 def _kind(text: str) -> str:
@@ -115,7 +110,7 @@ def load_alerts(path: Path) -> AlertSettings:
     faults = []
     for number, address in enumerate(settings.to):
         try:
-            target(address)
+            make_sender(address)
         except ValueError as error:
             faults.append(InputError(path, f"alerts.to[{number}]", "****", str(error)))
     if settings.ping is not None:
@@ -128,33 +123,3 @@ def load_alerts(path: Path) -> AlertSettings:
     if faults:
         raise InputError.joined(faults)
     return settings
-
-
-def expanded(address: str) -> str:
-    """Return an address with ``${NAME}`` replaced by variables of the environment.
-
-    Raises:
-        ValueError: one is not set.
-    """
-    missing = [name for name in _NAME.findall(address) if not os.environ.get(name)]
-    if missing:
-        raise ValueError(f"the environment variable {missing[0]} is not set")
-    return _NAME.sub(lambda found: os.environ[found[1]], address)
-
-
-def target(address: str) -> NotifyBase:
-    """Return what sends to an address.
-
-    Raises:
-        ValueError: it is none of Apprise's.
-        ModuleNotFoundError: the extra ``alerts`` is not installed.
-    """
-    from apprise import Apprise
-
-    found = Apprise.instantiate(expanded(address), suppress_exceptions=True)
-    if found is None:
-        raise ValueError(
-            "is not an address of Apprise; write one like mailto://user:password@example.org "
-            "(github.com/caronc/apprise lists all)"
-        )
-    return found

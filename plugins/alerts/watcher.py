@@ -5,45 +5,21 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from datetime import datetime
-from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
 from sliplab.flows.cli.status import state_lines
 from sliplab.flows.status import StatusReader, StoreStatus
 from sliplab.plugins.alerts.conditions import Event, events
-from sliplab.plugins.alerts.outbox import Outbox, Target
-from sliplab.plugins.alerts.settings import AlertSettings, expanded, target
+from sliplab.plugins.alerts.outbox import Outbox
+from sliplab.plugins.alerts.settings import AlertSettings
+from sliplab.plugins.alerts.targets import Target, expanded
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.store import Store
-
-if TYPE_CHECKING:
-    from apprise import NotifyBase
+from sliplab.storage.trials.store import TrialStore
 
 POLL_S = 3.0
 PING_S = 3600.0
 PING_LIMIT_S = 10.0
 """Longest wait for the answer to a ping."""
-
-
-class AppriseTarget:
-    """Sends by Apprise."""
-
-    def __init__(self, address: str) -> None:
-        self._sender: NotifyBase = target(address)
-        # by itself it pauses for 5.5 s; `Outbox` sends one message a look
-        self._sender.request_rate_per_sec = 0.0
-        self.name = str(self._sender.url(privacy=True)).partition("?")[0]
-
-    def send(self, title: str, text: str) -> bool:
-        """Return whether the message was taken; no error of a network or library comes out."""
-        from apprise import NotifyFormat
-        from apprise.logger import logger
-
-        logger.disabled = True  # its lines quote addresses
-        try:
-            return bool(self._sender.notify(body=text, title=title, body_format=NotifyFormat.TEXT))
-        except Exception:  # another package's code: whatever it raises
-            return False
 
 
 class AlertWatcher:
@@ -56,7 +32,7 @@ class AlertWatcher:
 
     def __init__(
         self,
-        store: Store,
+        store: TrialStore,
         settings: AlertSettings,
         targets: list[Target],
         now: datetime,

@@ -19,12 +19,12 @@ from scipy import special
 
 from sliplab.analysis.clocks.pulse_match import NoMatchError
 from sliplab.plugins.align.clock_state import ClockState
-from sliplab.plugins.align.events import Events, events_from
+from sliplab.plugins.align.events import ClockEvents, events_from
 from sliplab.plugins.align.runs import (
     BEND_PER_NS,
     MIN_EVENTS,
     MIN_KNOWN,
-    Run,
+    PairedRun,
     pairs_near,
     runs_by_pairs,
     runs_by_pattern,
@@ -279,7 +279,7 @@ def align(
     if isinstance(b, str) and b == "harp":
         if first.ids is None:
             raise InputError("align", "b", b, "needs ids of A that are a Harp clock's seconds")
-        second = Events("harp", first.ids * 10**9, first.ids)
+        second = ClockEvents("harp", first.ids * 10**9, first.ids)
     else:
         second = events_from(b, "b", unit, harp=harp)
     for events in (first, second):
@@ -299,7 +299,7 @@ class _Part:
     """Pairs of one stretch: indices into the sorted pieces, and what lies on its clock."""
 
     piece: int
-    run: Run
+    run: PairedRun
     state: ClockState
     outliers: int
     jump: float
@@ -309,7 +309,9 @@ class _Part:
 class _Fit:
     """Both lists as floats near 0, in pieces within which their times rise."""
 
-    def __init__(self, a: Events, b: Events, max_drift: float, offset_s: float | None) -> None:
+    def __init__(
+        self, a: ClockEvents, b: ClockEvents, max_drift: float, offset_s: float | None
+    ) -> None:
         self.a, self.b, self.max_drift, self.offset_s = a, b, max_drift, offset_s
         self.origin_a, self.origin_b = int(np.median(a.ns)), int(np.median(b.ns))
         self.unit = float(max(a.unit_ns, b.unit_ns))
@@ -378,7 +380,7 @@ class _Fit:
                 found.append(str(_not_in_order(events, pieces)))
         return "; ".join([*units, text, *found])
 
-    def _by_ids(self, ids_a: Ints, ids_b: Ints) -> list[tuple[int, Run]]:
+    def _by_ids(self, ids_a: Ints, ids_b: Ints) -> list[tuple[int, PairedRun]]:
         once_a, once_b = _unique(ids_a), _unique(ids_b)
         _, i, j = np.intersect1d(ids_a[once_a], ids_b[once_b], return_indices=True)
         i, j = once_a[i], once_b[j]
@@ -395,19 +397,19 @@ class _Fit:
             low, high = np.searchsorted(i, (begin, end)).tolist()
             u, v = i[low:high], j[low:high]
             for run in runs_by_pairs(self.x[u], self.y[v], self.floor):
-                found.append((piece, Run(u[run.a], v[run.b])))
+                found.append((piece, PairedRun(u[run.a], v[run.b])))
         if not found:
             raise NoMatchError("no_match", "the times of equal ids lie on no common clock")
         return found
 
-    def _by_offset(self, offset_s: float, within_s: float) -> list[tuple[int, Run]]:
+    def _by_offset(self, offset_s: float, within_s: float) -> list[tuple[int, PairedRun]]:
         if len(self.pieces_a) > 2 or len(self.pieces_b) > 2:
             raise NoMatchError("no_match", "a clock falls back, so that no one offset holds")
         offset = float(round(offset_s * 1e9) - (self.origin_b - self.origin_a))
         run = pairs_near(self.x, self.y, offset, within_s * 1e9, self.max_drift, self.floor)
         return [(0, run)]
 
-    def _by_pattern(self) -> list[tuple[int, Run]]:
+    def _by_pattern(self) -> list[tuple[int, PairedRun]]:
         found, refusal = [], None
         for piece, (begin, end) in enumerate(pairwise(self.pieces_a)):
             for low, high in pairwise(self.pieces_b):
@@ -418,17 +420,17 @@ class _Fit:
                 except NoMatchError as error:
                     refusal = refusal or error
                     continue
-                found += [(piece, Run(run.a + begin, run.b + low)) for run in runs]
+                found += [(piece, PairedRun(run.a + begin, run.b + low)) for run in runs]
         if not found and refusal is not None:
             raise refusal
         return sorted(found, key=lambda item: int(item[1].a[0]))
 
-    def _merged(self, runs: list[tuple[int, Run]]) -> list[tuple[int, Run]]:
+    def _merged(self, runs: list[tuple[int, PairedRun]]) -> list[tuple[int, PairedRun]]:
         """Join neighbours with no jump between them, as on both sides of a gap."""
         merged = runs[:1]
         for piece, run in runs[1:]:
             before = merged[-1][1]
-            both = Run(np.concatenate((before.a, run.a)), np.concatenate((before.b, run.b)))
+            both = PairedRun(np.concatenate((before.a, run.a)), np.concatenate((before.b, run.b)))
             rising = (np.diff(self.x[both.a]) > 0).all() and (np.diff(self.y[both.b]) > 0).all()
             if rising:
                 one, two = self._state(before), self._state(run)
@@ -440,10 +442,10 @@ class _Fit:
             merged.append((piece, run))
         return merged
 
-    def _state(self, run: Run) -> ClockState:
+    def _state(self, run: PairedRun) -> ClockState:
         return ClockState.through(self.x[run.a], self.y[run.b])
 
-    def _split(self, piece: int, run: Run, least: int) -> list[_Part]:
+    def _split(self, piece: int, run: PairedRun, least: int) -> list[_Part]:
         """Cut a run where its clock jumps, and leave out what is off it."""
         if run.a.size < least:
             return []
@@ -451,15 +453,15 @@ class _Fit:
         step = state.jump(least // 2)
         if step is not None and step.gain > _JUMP:
             at = step.at
-            halves = Run(run.a[:at], run.b[:at]), Run(run.a[at:], run.b[at:])
+            halves = PairedRun(run.a[:at], run.b[:at]), PairedRun(run.a[at:], run.b[at:])
             least = max(least // 2, MIN_KNOWN)
             return [part for half in halves for part in self._split(piece, half, least)]
         inside = ~state.outside
         if inside.mean() < 1 - _MOST_OUTSIDE:
             return []
-        return [self._part(piece, Run(run.a[inside], run.b[inside]), int((~inside).sum()))]
+        return [self._part(piece, PairedRun(run.a[inside], run.b[inside]), int((~inside).sum()))]
 
-    def _part(self, piece: int, run: Run, outliers: int) -> _Part:
+    def _part(self, piece: int, run: PairedRun, outliers: int) -> _Part:
         state = self._state(run)
         step = state.jump(min(MIN_KNOWN, run.a.size // 3))
         # one that may be there, and would be half as wrong on either side
@@ -628,14 +630,14 @@ class _Fit:
         return result
 
 
-def _until(run: Run, end: int) -> Run:
+def _until(run: PairedRun, end: int) -> PairedRun:
     keep = max(int(np.searchsorted(run.a, end)), MIN_KNOWN)
-    return Run(run.a[:keep], run.b[:keep])
+    return PairedRun(run.a[:keep], run.b[:keep])
 
 
-def _from(run: Run, begin: int) -> Run:
+def _from(run: PairedRun, begin: int) -> PairedRun:
     keep = max(min(int(np.searchsorted(run.a, begin)), run.a.size - MIN_KNOWN), 0)
-    return Run(run.a[keep:], run.b[keep:])
+    return PairedRun(run.a[keep:], run.b[keep:])
 
 
 def _rising(ns: Ints, origin: int) -> tuple[Floats, list[int], Ints]:
@@ -653,7 +655,7 @@ def _rising(ns: Ints, origin: int) -> tuple[Floats, list[int], Ints]:
     return (ns[order] - origin).astype(np.float64), edges, order
 
 
-def _not_in_order(events: Events, pieces: list[int]) -> InputError:
+def _not_in_order(events: ClockEvents, pieces: list[int]) -> InputError:
     """Return the error of a list that falls back at the beginning of each of its pieces."""
     k, falls = pieces[1], len(pieces) - 2
     before = f"is earlier than the event before ({events.ns[k - 1] / 1e9:.9g} s)"

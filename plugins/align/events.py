@@ -39,7 +39,7 @@ _WORD = 40
 
 
 @dataclass(frozen=True)
-class Events:
+class ClockEvents:
     """Events on one clock, in the order in which they were recorded.
 
     Attributes:
@@ -71,7 +71,9 @@ class Events:
         return unit
 
 
-def events_from(source: Any, name: str, unit: str | None = None, *, harp: bool = False) -> Events:
+def events_from(
+    source: Any, name: str, unit: str | None = None, *, harp: bool = False
+) -> ClockEvents:
     """Events of a file or an array.
 
     Args:
@@ -89,7 +91,7 @@ def events_from(source: Any, name: str, unit: str | None = None, *, harp: bool =
     """
     if unit is not None and unit not in TIME_UNITS:
         raise InputError(name, "unit", unit, "must be one of s, ms, us, ns")
-    if isinstance(source, Events):
+    if isinstance(source, ClockEvents):
         return source
     if isinstance(source, str | PathLike):
         return _from_csv(Path(source), unit, harp)
@@ -104,7 +106,7 @@ def events_from(source: Any, name: str, unit: str | None = None, *, harp: bool =
         if ids.dtype.kind not in "iu" or ids.shape != ns.shape:
             raise InputError(name, "ids", None, f"must be {ns.size} integers, one an event")
         ids = ids.astype(np.int64)
-    return Events(name, ns, ids)
+    return ClockEvents(name, ns, ids)
 
 
 def _ns_of(times: ArrayLike, name: str, unit: str | None) -> Ints:
@@ -155,7 +157,7 @@ def _rows(path: Path, unit: str | None) -> tuple[list[str], list[TableRow], str,
     return columns, rows, time, unit or named or "s"
 
 
-def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
+def _from_csv(path: Path, unit: str | None, harp: bool) -> ClockEvents:
     name = str(path)
     columns, rows, time, unit = _rows(path, unit)
     levels = _column(columns, _LEVELS)
@@ -169,7 +171,7 @@ def _from_csv(path: Path, unit: str | None, harp: bool) -> Events:
     if not rows:
         raise InputError(name, str(levels), None, "is 0 in every row; events are where it is 1")
     ids = _column(columns, _IDS)
-    return Events(
+    return ClockEvents(
         name,
         np.array([_time_ns(row, time, unit) for row in rows]),
         None if ids is None else np.array([_id(row, ids) for row in rows]),
@@ -241,7 +243,7 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def harp_words(name: str, ns: Ints, high: NDArray[np.bool_]) -> Events:
+def harp_words(name: str, ns: Ints, high: NDArray[np.bool_]) -> ClockEvents:
     """Words of a Harp clock among edges: each begins with a second, and says which.
 
     A word is 32 bits, little-endian, as four bytes with start and stop bits at `HARP_BAUD`; the
@@ -272,4 +274,4 @@ def harp_words(name: str, ns: Ints, high: NDArray[np.bool_]) -> Events:
             )
     if not begins:
         raise InputError(name, "", None, f"holds no Harp word ({HARP_BAUD:g} bits a second)")
-    return Events(name, np.array(begins, np.int64), np.array(seconds, np.int64))
+    return ClockEvents(name, np.array(begins, np.int64), np.array(seconds, np.int64))

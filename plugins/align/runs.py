@@ -47,7 +47,7 @@ _REFUSALS = {
 
 
 @dataclass(frozen=True)
-class Run:
+class PairedRun:
     """Indices (k,) of events of one stretch in both lists, ascending."""
 
     a: Ints
@@ -89,7 +89,7 @@ Pairing = Callable[[int, int, _Line], tuple[Ints, Ints, int]]
 """Pairs of events of A from one index up to another by a line, and how many there could be."""
 
 
-def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> list[Run]:
+def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> list[PairedRun]:
     """Stretches in which both lists show the same pattern of intervals.
 
     Args:
@@ -100,7 +100,7 @@ def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> lis
     Raises:
         NoMatchError: the lists fit nowhere, or in several places.
     """
-    found: list[Run] = []
+    found: list[PairedRun] = []
     first: NoMatchError | None = None
     # remainders: events of A and of B from one index up to another
     left = [(0, x.size, 0, y.size)]
@@ -113,7 +113,7 @@ def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> lis
         except NoMatchError as error:
             first = first or error
             continue
-        run = Run(run.a + a, run.b + c)
+        run = PairedRun(run.a + a, run.b + c)
         found.append(run)
         left.append((a, int(run.a[0]), c, int(run.b[0])))
         left.append((int(run.a[-1]) + 1, b, int(run.b[-1]) + 1, d))
@@ -126,7 +126,7 @@ def runs_by_pattern(x: Floats, y: Floats, max_drift: float, floor: float) -> lis
     return sorted(found, key=lambda run: int(run.a[0]))
 
 
-def _one_run(x: Floats, y: Floats, max_drift: float, floor: float) -> Run:
+def _one_run(x: Floats, y: Floats, max_drift: float, floor: float) -> PairedRun:
     tick = tick_of(np.rint(y).astype(np.int64))
     try:
         match = match_trains(x, y, tick, 1.02 * max_drift, None)
@@ -135,15 +135,15 @@ def _one_run(x: Floats, y: Floats, max_drift: float, floor: float) -> Run:
     if match.device.size < MIN_EVENTS:
         raise NoMatchError("no_match", f"only {match.device.size} events match")
     begin, end = _best_window(x, y, match.device, match.reference, MIN_EVENTS, floor)
-    seed = Run(match.device[begin:end], match.reference[begin:end])
+    seed = PairedRun(match.device[begin:end], match.reference[begin:end])
     line = _Line.through(x[seed.a], y[seed.b], floor)
 
     def paired(first: int, last: int, by: _Line) -> tuple[Ints, Ints, int]:
         return _nearest(x, y, first, last, by)
 
     i, j, could = paired(int(seed.a[0]), int(seed.a[-1]) + 1, line)
-    by_chance, _ = _other_places(x, y, Run(i, j), line)
-    run = _grown(x, y, Run(i, j), paired, (i.size / max(could, 1), by_chance), floor)
+    by_chance, _ = _other_places(x, y, PairedRun(i, j), line)
+    run = _grown(x, y, PairedRun(i, j), paired, (i.size / max(could, 1), by_chance), floor)
     by_chance, next_best = _other_places(x, y, run, _Line.through(x[run.a], y[run.b], floor))
     share = run.a.size / (min(int(np.ptp(run.a)), int(np.ptp(run.b))) + 1)
     if next_best > MOST_ALIKE * share:
@@ -165,14 +165,14 @@ def _one_run(x: Floats, y: Floats, max_drift: float, floor: float) -> Run:
     return run
 
 
-def runs_by_pairs(x: Floats, y: Floats, floor: float) -> list[Run]:
+def runs_by_pairs(x: Floats, y: Floats, floor: float) -> list[PairedRun]:
     """Stretches of pairs that lie on one clock.
 
     Args:
         x, y: (k,) times of the same events on A and B, x ascending, ns.
     """
 
-    found: list[Run] = []
+    found: list[PairedRun] = []
     left = [(0, x.size)]
     while left:
         a, b = left.pop()
@@ -191,8 +191,8 @@ def runs_by_pairs(x: Floats, y: Floats, floor: float) -> list[Run]:
         i, _, could = paired(begin, end, _Line.through(u[begin:end], v[begin:end], floor))
         if i.size < MIN_KNOWN:
             continue
-        run = _grown(u, v, Run(i, i), paired, (i.size / could, 0.02), floor)
-        run = Run(run.a + a, run.b + a)
+        run = _grown(u, v, PairedRun(i, i), paired, (i.size / could, 0.02), floor)
+        run = PairedRun(run.a + a, run.b + a)
         found.append(run)
         left += [(a, int(run.a[0])), (int(run.a[-1]) + 1, b)]
     return sorted(found, key=lambda run: int(run.a[0]))
@@ -200,7 +200,7 @@ def runs_by_pairs(x: Floats, y: Floats, floor: float) -> list[Run]:
 
 def pairs_near(
     x: Floats, y: Floats, offset: float, within: float, max_drift: float, floor: float
-) -> Run:
+) -> PairedRun:
     """Pairs by an approximate offset, which holds at the first event of A and drifts from there.
 
     Raises:
@@ -238,7 +238,7 @@ def pairs_near(
             f"{i.size} events of A have a partner within {within / 1e9:g} s of the offset; at "
             f"least {MIN_KNOWN} are needed",
         )
-    return Run(i, j)
+    return PairedRun(i, j)
 
 
 def _best_window(
@@ -267,7 +267,7 @@ def _nearest(x: Floats, y: Floats, first: int, last: int, line: _Line) -> tuple[
     return i + first, j + low, min(last - first, high - low)
 
 
-def _other_places(x: Floats, y: Floats, run: Run, line: _Line) -> tuple[float, float]:
+def _other_places(x: Floats, y: Floats, run: PairedRun, line: _Line) -> tuple[float, float]:
     """Share of a run's events that find a partner when shifted by some events: mean, and most."""
     middle = run.a.size // 2
     part = x[run.a[max(middle - 200, 0) : middle + 200]]
@@ -288,8 +288,13 @@ def _other_places(x: Floats, y: Floats, run: Run, line: _Line) -> tuple[float, f
 
 
 def _grown(
-    x: Floats, y: Floats, seed: Run, paired: Pairing, shares: tuple[float, float], floor: float
-) -> Run:
+    x: Floats,
+    y: Floats,
+    seed: PairedRun,
+    paired: Pairing,
+    shares: tuple[float, float],
+    floor: float,
+) -> PairedRun:
     """The run that grows from a seed to both sides.
 
     Args:
@@ -325,4 +330,4 @@ def _grown(
         if evidence > 0.0:
             keep = slice(last_good) if forward else slice(i.size - last_good, None)
             i, j = i[keep], j[keep]
-    return Run(i, j)
+    return PairedRun(i, j)

@@ -48,7 +48,7 @@ class AtiNetFtSettings(DriverSettings):
     """Counts of a newton metre; given together with `counts_per_n`."""
     filter_hz: Filter | None = None
     """Cut-off of the sensor's own low-pass filter, written when it is connected; 0 is no filter;
-    null leaves it as it is set. A filter delays what it reports: see `timing.force_delay`."""
+    null leaves it as it is set. A filter delays what it reports: see `timing.force.delay`."""
     bias: Literal["trial", "session", "never"] = "trial"
     """When the present load becomes zero: before every trial while the sensor is clear of the
     plate, once when it is connected, or never."""

@@ -164,7 +164,7 @@ def _value(span: Span, rng: np.random.Generator) -> float:
 
 
 @dataclass(frozen=True)
-class Taken:
+class SimulatedTrial:
     """A simulated trial: its devices, what they sent, and the truth."""
 
     devices: MockDevices
@@ -178,7 +178,7 @@ class Taken:
         return self.done.truth
 
 
-def take(drawn: SceneDraw, watch: Callable[[SimulatedWorld], None] | None = None) -> Taken:
+def take(drawn: SceneDraw, watch: Callable[[SimulatedWorld], None] | None = None) -> SimulatedTrial:
     """Simulate the trial of a scene.
 
     Args:
@@ -200,7 +200,7 @@ def take(drawn: SceneDraw, watch: Callable[[SimulatedWorld], None] | None = None
         done = rig.run_trial(plan.program(plan.trials[0]), sink, drawn.seed, None, SYNC_HZ)
     finally:
         rig.close()
-    return Taken(devices, sink, done)
+    return SimulatedTrial(devices, sink, done)
 
 
 def simulated(drawn: SceneDraw) -> Scene:
@@ -212,13 +212,13 @@ def simulated(drawn: SceneDraw) -> Scene:
     return scene_of_trial(drawn, take(drawn))
 
 
-def since_us(taken: Taken, onset_ns: int) -> int:
+def since_us(taken: SimulatedTrial, onset_ns: int) -> int:
     """Return microseconds from the begin of a scene to an onset of its truth."""
     moved_ns = next(step.start_ns for step, _ in taken.done.steps if step.phase == "slide")
     return (onset_ns - taken.truth["reference_ns"] + moved_ns - taken.done.recorded_ns[0]) // 1000
 
 
-def scene_of_trial(drawn: SceneDraw, taken: Taken) -> Scene:
+def scene_of_trial(drawn: SceneDraw, taken: SimulatedTrial) -> Scene:
     """Return the scene that a simulated trial is."""
     truth = taken.truth
     begin_ns, end_ns = taken.done.recorded_ns

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.plugins.claims.blocks import F64, I64, MeanEstimate, of_trials
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.claims import Claim, LevelDifference, Stopping
 from sliplab.protocols.factors import Factor
 
@@ -28,7 +28,7 @@ class TrialGrid:
         stretch: (N,) int64, number of the combination of levels that a person sets.
     """
 
-    trials: tuple[Trial, ...]
+    trials: tuple[PlannedTrial, ...]
     factors: Mapping[str, Factor]
     levels: I64
     stretch: I64

@@ -36,14 +36,14 @@ from sliplab.plugins.claims.document import (
 from sliplab.plugins.claims.evidence import ClaimEvidence, TrialGrid
 from sliplab.plugins.claims.shown import count_text, verdict_text
 from sliplab.plugins.claims.states import Fits, settled, states
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.claims import Stopping, section_hash
 from sliplab.storage.files import write_json
 from sliplab.storage.process import out_of_reach
 from sliplab.storage.schema.campaign_end import CHOICES, STOPPING, Verdict
 from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 WAIT_S = 600.0
 """Longest wait for the figures of a trial."""
@@ -55,7 +55,7 @@ class ClaimWatch:
     Use as a context: it owns the process that makes the figures. It is the hook `more_trials`.
     """
 
-    def __init__(self, run_request: RunRequest, store: Store, campaign: Campaign) -> None:
+    def __init__(self, run_request: RunRequest, store: TrialStore, campaign: Campaign) -> None:
         collection = run_request.plan.protocol.collection
         assert collection.stopping is not None
         self._run_request, self._store, self._campaign = run_request, store, campaign
@@ -82,7 +82,7 @@ class ClaimWatch:
         if pool is not None:
             pool.shutdown(wait=not stopping.requested(), cancel_futures=True)
 
-    def committed(self, trial: Trial) -> None:
+    def committed(self, trial: PlannedTrial) -> None:
         """Begin to make the figures of a trial that was just committed."""
         from sliplab.flows.running.parallel_map import make_in_process, trial_job  # loads Prefect
 
@@ -117,7 +117,7 @@ class ClaimWatch:
             self._kept.write(trial, work.key, made)
         return TrialFigures.model_validate(self._kept.read(trial))
 
-    def next_trials(self) -> list[Trial]:
+    def next_trials(self) -> list[PlannedTrial]:
         """Return the pending trials of the earliest incomplete round; none at the end."""
         pending = {trial.id for trial in pending_trials(self._run_request.plan, self._campaign)}
         begun, last = 0, -1
@@ -140,7 +140,7 @@ class ClaimWatch:
         """Number of rounds whose figures are waited for while the next one is taken."""
         return 0 if self._choice is None else 1
 
-    def _rounds(self) -> Iterator[list[Trial]]:
+    def _rounds(self) -> Iterator[list[PlannedTrial]]:
         """Yield the trials of each round, references among them; an adaptive one is chosen then."""
         if self._choice is None:
             yield from self._planned
@@ -152,10 +152,12 @@ class ClaimWatch:
             number += 1
 
     @cached_property
-    def _planned(self) -> list[list[Trial]]:
+    def _planned(self) -> list[list[PlannedTrial]]:
         """The plan's trials by round."""
-        rounds: list[list[Trial]] = []
-        waiting: list[Trial] = []  # a reference trial comes before the one that it belongs to
+        rounds: list[list[PlannedTrial]] = []
+        waiting: list[
+            PlannedTrial
+        ] = []  # a reference trial comes before the one that it belongs to
         for trial in self._run_request.plan:
             waiting.append(trial)
             if trial.role == "measured":
@@ -167,7 +169,7 @@ class ClaimWatch:
 
     # choice
 
-    def _chosen(self, first: int, count: int) -> list[Trial] | None:
+    def _chosen(self, first: int, count: int) -> list[PlannedTrial] | None:
         """Return the trials of some batches by number; choose those that are missing."""
         assert self._choice is not None
         batches = list(self._batches)
@@ -186,12 +188,12 @@ class ClaimWatch:
         wanted = {item.trial for batch in batches[first : first + count] for item in batch.trials}
         return [trial for before, trial in found if before in wanted] or None
 
-    def _in_order(self) -> list[tuple[str, Trial]]:
+    def _in_order(self) -> list[tuple[str, PlannedTrial]]:
         """Return chosen trials and references by place, each with the chosen one it belongs to."""
         plan = self._run_request.plan
         every = plan.protocol.collection.references
         references = iter([trial for trial in plan if trial.role == "reference"])
-        found: list[tuple[str, Trial]] = []
+        found: list[tuple[str, PlannedTrial]] = []
         ids = [item.trial for batch in self._batches for item in batch.trials]
         for taken, name in enumerate(ids):
             if every is not None and taken % every.every == 0:

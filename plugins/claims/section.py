@@ -15,7 +15,7 @@ from sliplab.plugins.claims.document import Look, StoppingRecord
 from sliplab.plugins.claims.shown import verdict_text
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.schema.campaign_end import CHOICES, Verdict
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ENDED: dict[Verdict, str] = {
     "open": "It has not ended: the next collection continues.",
@@ -72,7 +72,7 @@ class ClaimsSection(Content):
         return [each.figure for each in self.campaigns]
 
 
-def claims_key(store: Store, campaigns: Sequence[Collected]) -> list[str]:
+def claims_key(store: TrialStore, campaigns: Sequence[Collected]) -> list[str]:
     """Return the further inputs of a report with claims; empty without any."""
     found = [StoppingRecord.of(item.campaign.folder) for item in campaigns]
     return [hash_data(each.to_json()) for each in found if each is not None]

@@ -40,7 +40,7 @@ from sliplab.plugins.classes.document import (
 )
 from sliplab.storage.schema.evaluation import Baseline, PartTrials
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -89,7 +89,7 @@ def make_class_job(
     return ClassJob(labels, campaigns, classes, models, model, key)
 
 
-def class_evaluation_of(store: Store) -> ClassEvaluation:
+def class_evaluation_of(store: TrialStore) -> ClassEvaluation:
     """Return the store's evaluation of classes.
 
     Raises:

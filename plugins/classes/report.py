@@ -42,7 +42,7 @@ from sliplab.plugins.classes.evaluation import SPLITS, class_evaluation_of
 from sliplab.storage.schema.evaluation import Share
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 _HERE = Path(__file__).parent
 SHOWN = 40
@@ -53,7 +53,7 @@ _ALMOST = 0.95
 """Share of the last accuracy that counts as almost all of it."""
 
 
-def class_report_key(store: Store, campaigns: list[Collected]) -> str:
+def class_report_key(store: TrialStore, campaigns: list[Collected]) -> str:
     """Return the key of all inputs of the report.
 
     Raises:
@@ -85,7 +85,7 @@ def _title(item: Collected) -> str:
     return "" if item.recorded is None else item.recorded.adapter.title
 
 
-def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
+def class_summary(store: TrialStore, campaigns: list[Collected]) -> ClassSummary:
     """Make the summary.
 
     Raises:
@@ -111,7 +111,7 @@ def class_summary(store: Store, campaigns: list[Collected]) -> ClassSummary:
     )
 
 
-def class_numbers(store: Store) -> Json:
+def class_numbers(store: TrialStore) -> Json:
     """Return the numbers of the evaluation under the report's keys, without a report.
 
     Raises:
@@ -497,7 +497,7 @@ class ClassMadeSection(Content):
 
 
 def _made_section(
-    store: Store, campaigns: Sequence[Collected], summary: ClassSummary, fitted: Fitted
+    store: TrialStore, campaigns: Sequence[Collected], summary: ClassSummary, fitted: Fitted
 ) -> ClassMadeSection:
     place = store.folder.resolve()
     chosen = campaigns[0].settings
@@ -545,7 +545,7 @@ def _made_section(
 
 
 def class_sections(
-    store: Store, campaigns: list[Collected], summary: ClassSummary, model: ModelOnDisk
+    store: TrialStore, campaigns: list[Collected], summary: ClassSummary, model: ModelOnDisk
 ) -> list[Content]:
     """Make all sections, in order."""
     fitted = model_file.load(model.path)
@@ -561,7 +561,7 @@ def class_sections(
     return [section for section in sections if section is not None]
 
 
-def class_page(store: Store, campaigns: list[Collected], model: ModelOnDisk) -> pages.Page:
+def class_page(store: TrialStore, campaigns: list[Collected], model: ModelOnDisk) -> pages.Page:
     """Return the page about recordings of classes.
 
     Args:

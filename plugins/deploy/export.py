@@ -47,7 +47,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import json_text, sha256
 from sliplab.storage.schema.evaluation import Accuracy, CountChange, Latencies
 from sliplab.storage.schema.model import TrainedModel
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 SPLITS = ("train", "validation", "test")
 CHECKED = 256
@@ -67,7 +67,7 @@ class _Source:
     path: Path
     sha256: str
     fitted: Fitted
-    store: Store
+    store: TrialStore
     campaigns: list[Collected]
     labels: StoreLabels
 
@@ -252,7 +252,7 @@ class ExportFigures(TypedDict):
 def export_files(
     model: Path,
     fitted: Fitted,
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     checked: int | None,
     advance: Callable[[str], None],

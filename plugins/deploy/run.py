@@ -12,7 +12,7 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.running import console
 from sliplab.plugins.deploy.export import CHECKED, ExportFigures, export_files
 from sliplab.storage.files import make_folder, write_bytes, write_text
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 class Exported(ExportFigures):
@@ -25,7 +25,7 @@ def export_model(
     model: Path,
     fitted: Fitted,
     out: Path,
-    store: Store,
+    store: TrialStore,
     names: list[str] | None = None,
     *,
     onnx: bool = True,

@@ -21,7 +21,7 @@ OFFSET_READS, OFFSET_EVERY_S = 10, 0.01
 
 
 @dataclass(frozen=True)
-class Answer:
+class DriverCall:
     """One call of the driver.
 
     Attributes:
@@ -55,11 +55,11 @@ class Report:
     begin_s: float
     before: Pose
     offset_ns: int
-    start: Answer | None = None
+    start: DriverCall | None = None
     end_s: float = 0.0
-    answers: list[Answer] = field(default_factory=list)
+    answers: list[DriverCall] = field(default_factory=list)
 
-    def of(self, name: str) -> list[Answer]:
+    def of(self, name: str) -> list[DriverCall]:
         """Return the calls of one name, in order."""
         return [answer for answer in self.answers if answer.name == name]
 
@@ -101,17 +101,17 @@ def true_course(bench: ArmBench, begin_s: float, end_s: float) -> TrueMotion:
     return TrueMotion(t_s, [bench.true_pose(at) for at in t_s.tolist()])
 
 
-def ask(bench: ArmBench, name: str, work: Callable[[], Any]) -> Answer:
+def ask(bench: ArmBench, name: str, work: Callable[[], Any]) -> DriverCall:
     """Make a call of the driver. Raises Seen or RigError."""
     before, begin_s = bench.moving(), bench.clock_s()
     value = bench.call(name, work)
     end_s = bench.clock_s()
-    return Answer(name, begin_s, end_s, before and bench.moving(), value)
+    return DriverCall(name, begin_s, end_s, before and bench.moving(), value)
 
 
 def clock_offset_ns(bench: ArmBench) -> int:
     """Return the driver's clock minus the true one, ns; a stale answer of `now_ns` is too low."""
-    reads: list[Answer] = []
+    reads: list[DriverCall] = []
     for _ in range(OFFSET_READS):
         reads.append(ask(bench, "now_ns", bench.arm.now_ns))
         bench.wait(OFFSET_EVERY_S)

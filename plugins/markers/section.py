@@ -37,7 +37,7 @@ from sliplab.storage.schema.evaluation import (
 )
 from sliplab.storage.schema.summary import Kinematic, OneCameraSummary
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class EvaluatedClassifier:
     evaluation: Evaluation
 
 
-def read_judged(store: Store, campaigns: list[Collected]) -> EvaluatedClassifier | None:
+def read_judged(store: TrialStore, campaigns: list[Collected]) -> EvaluatedClassifier | None:
     """Read the classifier and its evaluation; None where either is missing or stale."""
     stored = Derived.of(store, STEP)
     if stored.key(NAME) is None:
@@ -70,7 +70,10 @@ def read_judged(store: Store, campaigns: list[Collected]) -> EvaluatedClassifier
 
 
 def with_classifier(
-    summary: OneCameraSummary, store: Store, campaigns: list[Collected], judged: EvaluatedClassifier
+    summary: OneCameraSummary,
+    store: TrialStore,
+    campaigns: list[Collected],
+    judged: EvaluatedClassifier,
 ) -> OneCameraSummary:
     """Add the classifier's figures, under the names that the spiking network's have."""
     evaluation = judged.evaluation
@@ -146,7 +149,10 @@ def _network_section(
 
 
 def marker_sections(
-    store: Store, campaigns: list[Collected], summary: OneCameraSummary, judged: EvaluatedClassifier
+    store: TrialStore,
+    campaigns: list[Collected],
+    summary: OneCameraSummary,
+    judged: EvaluatedClassifier,
 ) -> list[Content]:
     """Make the sections about the classifier, in order."""
     assert summary.kinematic is not None

@@ -16,7 +16,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import did_you_mean, one_of
 
 if TYPE_CHECKING:
-    from sliplab.storage.trials.store import Campaign, Store
+    from sliplab.storage.trials.store import Campaign, TrialStore
 
 app = typer.Typer()
 
@@ -74,7 +74,7 @@ def write(request: ExportRequest) -> ExportResult:
 EXPORT = Export("store", write, frozenset({"campaign", "title", "creator", "licence"}))
 
 
-def _campaigns(store: Store, names: Sequence[str] | None) -> tuple[Campaign, ...]:
+def _campaigns(store: TrialStore, names: Sequence[str] | None) -> tuple[Campaign, ...]:
     """Return the campaigns of a store, or those named."""
     known = {item.name: item for item in store.campaigns()}
     for name in names or ():

@@ -36,7 +36,7 @@ from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import PROTOCOL, RIG, STORE, SYNC, Campaign, Store
+from sliplab.storage.trials.store import PROTOCOL, RIG, STORE, SYNC, Campaign, TrialStore
 from sliplab.storage.trials.verify import trial_folders, verify_trial
 
 CAMPAIGNS, CARD = "campaigns", "croissant.json"
@@ -85,7 +85,7 @@ def read_publication(path: Path) -> Iterator[ForeignTrial]:
     if folder is None:
         raise InputError(path, "", None, f"is no publication: it lacks {STORE} or {CARD}")
     try:
-        store = Store.open(folder)
+        store = TrialStore.open(folder)
         found = [item for item in store.campaigns() if path in (folder, item.folder)]
         if len(found) != 1:
             raise _several(path, [item.folder for item in store.campaigns()])
@@ -130,7 +130,7 @@ def _plain(file: Path) -> Path:
 
 
 def _trial(
-    store: Store, where: Campaign, texts: CampaignTexts, folder: Path, source: str
+    store: TrialStore, where: Campaign, texts: CampaignTexts, folder: Path, source: str
 ) -> ForeignTrial:
     if folder.is_symlink() or not folder.is_dir():
         raise DamagedFile(folder, "", None, "is not a trial folder")
@@ -168,7 +168,9 @@ class PublishedTrial:
     derived: dict[str, list[Path]]
 
     @uninterrupted
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
+    def restore(
+        self, store: TrialStore, campaign: Campaign, name: str, about: Json
+    ) -> StreamCounts:
         """Commit the trial with its label and clocks.
 
         Args:
@@ -209,7 +211,7 @@ class PublishedTrial:
             protect(file)
         sync_folder(incoming)
 
-    def _copy_derived(self, store: Store, campaign: Campaign) -> Iterator[Path]:
+    def _copy_derived(self, store: TrialStore, campaign: Campaign) -> Iterator[Path]:
         for step, files in self.derived.items():
             target = Derived.of(store, step, campaign.name).folder
             for file in sorted(files, reverse=True):  # arrays first: the document decides

@@ -32,7 +32,7 @@ from sliplab.storage.streams import EVENTS_KIND, I64, WRENCH, Json
 from sliplab.storage.trials.checksums import FRAMES as VIDEO_FILE
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.video import copy_frames
 
 VERSION, FPS = "v3.0", 100
@@ -218,7 +218,7 @@ def _pictures(size: tuple[int, int], channels: int) -> Json:
     return {"dtype": "image", "shape": [size[1], size[0], channels], "names": names}
 
 
-def _episode(made: _Set, store: Store, campaign: Campaign, recording: Recording) -> None:
+def _episode(made: _Set, store: TrialStore, campaign: Campaign, recording: Recording) -> None:
     """Write one trial's rows as a separate file."""
     start, count = _grid(recording)
     ends = start + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
@@ -327,7 +327,7 @@ def _task(recording: Recording) -> str:
     )
 
 
-def _slip(store: Store, campaign: Campaign, recording: Recording, ends: I64) -> I64:
+def _slip(store: TrialStore, campaign: Campaign, recording: Recording, ends: I64) -> I64:
     """Return 0 before slip, 1 from its first onset, 2 from its second; -1 without a label."""
     try:
         label = Derived.of(store, LABELS, campaign.name).load(recording.folder.name, TrialLabel)

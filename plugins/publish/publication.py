@@ -18,7 +18,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 LICENCES = (
     "CC0-1.0",
@@ -99,7 +99,7 @@ class Publication:
         splits: part of the split of each trial, by campaign and id; imported ones have none.
     """
 
-    store: Store
+    store: TrialStore
     campaigns: tuple[Campaign, ...]
     about: PublicationInfo
     splits: Mapping[tuple[str, str], str] = field(default_factory=dict)

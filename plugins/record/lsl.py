@@ -58,7 +58,7 @@ class LslSettings(DriverSettings):
     """Silence that is a fault, seconds: of a stream with a rate, or of its sender's clock."""
 
 
-class Reading(NamedTuple):
+class ClockReading(NamedTuple):
     """A reading of the sender's clock, ns.
 
     Attributes:
@@ -96,8 +96,8 @@ class JumpRemover:
 
     def __init__(self) -> None:
         self.shift_ns = self.error_ns = 0
-        self._first: Reading | None = None
-        self._last: Reading | None = None
+        self._first: ClockReading | None = None
+        self._last: ClockReading | None = None
         self._drift, self._drift_error = 0.0, DRIFT_PPM * 1e-6
         self._lags: deque[float] = deque(maxlen=1000)
 
@@ -105,7 +105,7 @@ class JumpRemover:
         """Begin a run: times are those of the clock as it is now."""
         self.shift_ns = self.error_ns = 0
 
-    def reading(self, new: Reading) -> int:
+    def reading(self, new: ClockReading) -> int:
         """Take a reading; return the clock's jump since the one before, ns, or 0."""
         last, self._last = self._last, new
         if last is None or self._first is None:
@@ -121,7 +121,7 @@ class JumpRemover:
         self.error_ns += round(widths + self._drift_error * passed)
         return round(self._drift * passed) - step
 
-    def _learn(self, new: Reading) -> None:
+    def _learn(self, new: ClockReading) -> None:
         """Estimate the drift by the readings since the last jump."""
         assert self._first is not None
         run = new.device_ns - self._first.device_ns
@@ -132,7 +132,7 @@ class JumpRemover:
             self._drift = (new.offset_ns - self._first.offset_ns) / run
             self._drift_error = error
 
-    def times(self, stamp_ns: I64, host_ns: I64, before: Reading | None, jump_ns: int) -> I64:
+    def times(self, stamp_ns: I64, host_ns: I64, before: ClockReading | None, jump_ns: int) -> I64:
         """Return the times of samples between two readings, without the clock's jump there.
 
         Args:
@@ -178,7 +178,7 @@ class LslStream:
         self._fault: str | None = None
         self._running = False
         self._jumps = JumpRemover()
-        self._history: deque[Reading] = deque(maxlen=_HISTORY)
+        self._history: deque[ClockReading] = deque(maxlen=_HISTORY)
         self._reset()
 
     def _reset(self) -> None:
@@ -345,7 +345,7 @@ class LslStream:
         stamp_ns = np.rint(stamps * 1e9).astype(np.int64)
         self._held.append(_Held(stamp_ns, host_ns, np.asarray(values, np.float64)))
 
-    def _take(self, reading: Reading) -> None:
+    def _take(self, reading: ClockReading) -> None:
         """Take a reading, and release the samples before it."""
         before = self._history[-1]
         if reading.host_ns < before.host_ns + _APART_NS:
@@ -357,13 +357,13 @@ class LslStream:
         self._release(before, reading, jump)
         self._note(reading)
 
-    def _note(self, reading: Reading) -> None:
+    def _note(self, reading: ClockReading) -> None:
         """Keep a reading for `clock_reads`."""
         half = (reading.width_ns + 1) // 2
         t_ns, host_ns = reading.device_ns - self._jumps.shift_ns, reading.host_ns
         self._reads.append((t_ns, host_ns - half, host_ns + half, self._jumps.error_ns))
 
-    def _release(self, before: Reading | None, after: Reading | None, jump: int) -> None:
+    def _release(self, before: ClockReading | None, after: ClockReading | None, jump: int) -> None:
         """Release samples that came before a reading; all without one."""
         last = np.iinfo(np.int64).max if after is None else after.host_ns
         held = [each for each in self._held if each.host_ns <= last]
@@ -375,7 +375,7 @@ class LslStream:
             self._ready.append((t_ns, host, stamp, np.concatenate([each.values for each in held])))
         self._jumps.shift_ns += jump
 
-    def _read_clock(self, inlet: Any) -> Reading:
+    def _read_clock(self, inlet: Any) -> ClockReading:
         """Return the newest reading of the sender's clock; the first one takes 0.7 s."""
         import pylsl
 
@@ -385,7 +385,7 @@ class LslStream:
             inlet.obj, ctypes.byref(remote), ctypes.byref(width), READ_S, ctypes.byref(error)
         )
         pylsl.util.handle_error(error)
-        return Reading(*(round(each.value * 1e9) for each in (remote, offset, width)))
+        return ClockReading(*(round(each.value * 1e9) for each in (remote, offset, width)))
 
 
 def _library() -> Any:

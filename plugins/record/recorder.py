@@ -41,7 +41,7 @@ from sliplab.storage.process import give_memory_back
 from sliplab.storage.schema.trial import Mark, Provenance, TrialRecord
 from sliplab.storage.streams import FRAMES_KIND, Chunk, Json
 from sliplab.storage.trials.prefix_journal import BEGUN
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.writer import TrialWriter
 from sliplab.storage.versions import RECORDING, installed_versions
 
@@ -124,7 +124,7 @@ class Recorder:
                     check_common(key, names, self.sources)
             if self._pulses is not None and all(s.clock != READS for s in self.sources):
                 check_pulses(self._pulses, self.sources)
-            store = Store.create(self._store)
+            store = TrialStore.create(self._store)
             undo.enter_context(store_lock(store, collects=self._name if self._collects else ""))
             self.campaign: Campaign = store.campaign(self._name)
             locks = {

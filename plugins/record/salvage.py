@@ -14,11 +14,11 @@ from sliplab.storage.trials.checksums import PROVENANCE, RECORD
 from sliplab.storage.trials.prefix import keep_prefix
 from sliplab.storage.trials.prefix_journal import BEGUN, JOURNAL
 from sliplab.storage.trials.recovery import recover
-from sliplab.storage.trials.store import IMPORTED, Campaign, Store
+from sliplab.storage.trials.store import IMPORTED, Campaign, TrialStore
 from sliplab.storage.trials.writer import data_files
 
 
-def salvage(store: Store) -> list[str]:
+def salvage(store: TrialStore) -> list[str]:
     """Commit what verifies of all killed recordings of a store, whose lock the caller holds.
 
     Returns:

@@ -25,7 +25,7 @@ from sliplab.flows.running import console
 from sliplab.flows.store_detectors import detectors_of
 from sliplab.plugins.reflex.document import ReactionParts, ReflexStudy, ReflexTrial
 from sliplab.plugins.reflex.rows import dropped, extra_force_n, reflex_rows
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.hashing import hash_data, hash_text
 from sliplab.protocols.program import ACTING, Move
@@ -61,7 +61,7 @@ class _Never(Detector):
 class ReflexCase:
     """One trial with a detector and a reflex, or without; a point of the sweep."""
 
-    trial: Trial
+    trial: PlannedTrial
     detector: str | None
     reflex: str | None
     key: str
@@ -277,7 +277,7 @@ def measure(
     )
 
 
-def _speed_mm_s(plan: Plan, trial: Trial) -> float:
+def _speed_mm_s(plan: Plan, trial: PlannedTrial) -> float:
     """Speed of the trial's motion in contact."""
     moves = [it for it in plan.program(trial).steps if isinstance(it, Move) and it.phase in ACTING]
     return moves[0].speed_mm_s

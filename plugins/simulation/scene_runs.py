@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sliplab.plugins.simulation.settings import ClockErrors, scene_of
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.program import ACTING
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
@@ -101,7 +101,7 @@ class Memory(NullSink):
         return chunk.concatenate(self._chunks[device, chunk])
 
 
-def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
+def run(rig: RigFile, plan: Plan, trial: PlannedTrial, seed: int) -> SceneRun:
     """Simulate a trial; return its data, on a time line that begins with its motion.
 
     Args:
@@ -141,7 +141,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> SceneRun:
 def timed(
     rig: RigFile,
     plan: Plan,
-    trial: Trial,
+    trial: PlannedTrial,
     seed: int,
     clock: Callable[[], float] = perf_counter,
 ) -> float:
@@ -155,7 +155,7 @@ def timed(
         built.close()
 
 
-def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
+def _ready(rig: RigFile, plan: Plan, trial: PlannedTrial) -> Rig:
     """Return the rig with what the trial needs mounted, as a session does it."""
     built = build_rig(rig)
     built.connect()
@@ -165,6 +165,6 @@ def _ready(rig: RigFile, plan: Plan, trial: Trial) -> Rig:
     return built
 
 
-def _run(built: Rig, plan: Plan, trial: Trial, seed: int, sink: Memory) -> TrialRun:
+def _run(built: Rig, plan: Plan, trial: PlannedTrial, seed: int, sink: Memory) -> TrialRun:
     rate_hz = plan.protocol.collection.recording.sync_rate
     return built.run_trial(plan.program(trial), sink, seed, None, rate_hz)

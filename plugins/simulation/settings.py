@@ -472,7 +472,9 @@ def skin_of(settings: MockSettings) -> scene_skin.Skin:
     measured = None
     if made.papillae is not None:
         columns = zip(*((p.height_mm, p.friction, p.offset_mm) for p in made.papillae), strict=True)
-        measured = scene_skin.Made(*(np.array(column, np.float64) for column in columns))
+        measured = scene_skin.MeasuredGeometry(
+            *(np.array(column, np.float64) for column in columns)
+        )
     seed = settings.seed if made.seed is None else made.seed
     return scene_skin.make_skin(geometry, seed, measured)
 

@@ -14,7 +14,7 @@ from sliplab.analysis.report.programs import CommandResult
 from sliplab.plugins.studies.detector.document import DetectorRow, DetectorTradeoff, mean
 from sliplab.plugins.studies.plot import AxisPair, DetectorPoint, cost_and_error
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 RESULT = CommandResult("report/detector_tradeoff.json", "sliplab tradeoff {store}")
 
@@ -43,7 +43,7 @@ class TradeoffSection(Content):
         return self.search is None
 
 
-def tradeoff_section(store: Store, found: Json | None) -> TradeoffSection:
+def tradeoff_section(store: TrialStore, found: Json | None) -> TradeoffSection:
     """Show the search of detectors; None: there was none.
 
     Raises:

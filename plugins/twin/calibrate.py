@@ -56,7 +56,7 @@ from sliplab.rigs.twin import ConditionRange, FittedValue, TwinRecord
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 LIKE = 1.25
 """Noise of tracking that differs by less than this factor from the rig file's is the rig file's."""
@@ -185,7 +185,7 @@ def with_tracking_noise(rig: RigFile, pilot: PilotSlides) -> RigFile:
     return changed(rig, {"frame_camera": {"centroid_noise_px": float(f"{noise_px:.2g}")}})
 
 
-def fit_scene(store: Store, pilot: PilotSlides, prior: Prior, worlds: int) -> SceneFit:
+def fit_scene(store: TrialStore, pilot: PilotSlides, prior: Prior, worlds: int) -> SceneFit:
     """Compare a pilot with simulated worlds."""
     prior = replace(prior, rig=with_tracking_noise(prior.rig, pilot), zero_mm=pilot.zero_mm)
     observed = pilot.statistics(guess_of(prior.rig, prior.zero_mm))
@@ -200,7 +200,7 @@ def fit_scene(store: Store, pilot: PilotSlides, prior: Prior, worlds: int) -> Sc
 
 
 def calibrate_scene(
-    store: Store, item: Collected, wanted: FitRequest
+    store: TrialStore, item: Collected, wanted: FitRequest
 ) -> tuple[TwinFit, SameTrials]:
     """Fit a rig's scene to a campaign's slides, and write the twin's rig file.
 

@@ -213,7 +213,7 @@ def _length_of(covariance: F64) -> float:
 
 
 @dataclass(frozen=True)
-class Papillae:
+class PapillaEstimates:
     """m papillae as a pilot shows them, with standard errors.
 
     Attributes:
@@ -232,7 +232,7 @@ class Papillae:
     friction_error: F64
 
 
-def papillae(contact: ContactSlides) -> Papillae | None:
+def papillae(contact: ContactSlides) -> PapillaEstimates | None:
     """Return a pilot's estimates of each papilla; None without a fit."""
     fit, ring, place = contact.springs, contact.ring, contact.place_mm
     if fit is None:
@@ -240,7 +240,7 @@ def papillae(contact: ContactSlides) -> Papillae | None:
     apart = np.linalg.norm(rest_places(contact.slips) - place, axis=2)
     seen = np.maximum(np.isfinite(apart).sum(axis=0), 2)
     error = np.sqrt(mean_seen(apart**2) / 2 / (seen - 1))
-    return Papillae(
+    return PapillaEstimates(
         ring,
         place - mean_seen(place),
         error,

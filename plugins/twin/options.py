@@ -11,7 +11,7 @@ from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
 WorldsOption = Annotated[
     int, typer.Option("--worlds", min=100, max=100_000, help="Worlds to simulate.")
@@ -27,7 +27,7 @@ SeedOption = Annotated[
 ]
 
 
-def campaigns_of(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:
+def campaigns_of(folder: Path, names: list[str] | None) -> tuple[TrialStore, list[Collected]]:
     """Return a store and its campaigns of these names; all without any."""
     from sliplab.flows.steps import prepare_store
     from sliplab.storage.remote.mirror import open_store
@@ -39,7 +39,7 @@ def campaigns_of(folder: Path, names: list[str] | None) -> tuple[Store, list[Col
     return store, collected(store, names)
 
 
-def one_campaign(folder: Path, name: str | None) -> tuple[Store, Collected]:
+def one_campaign(folder: Path, name: str | None) -> tuple[TrialStore, Collected]:
     """Return a store and its campaign of this name, which may be left out if it is the only one.
 
     Raises:

@@ -24,14 +24,14 @@ from sliplab.plugins.twin.pilot import (
     slide_of,
 )
 from sliplab.plugins.twin.statistics import SlideStatistics, statistics
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import FORCE
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, WrenchChunk
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 LEVEL = "L3"
 """All physics: what a scene may leave out is not known before it was fitted."""
@@ -62,8 +62,8 @@ class PilotSlides:
     """
 
     plan: Plan
-    fitted: tuple[Trial, ...]
-    judged: tuple[Trial, ...]
+    fitted: tuple[PlannedTrial, ...]
+    judged: tuple[PlannedTrial, ...]
     slides: Mapping[str, PilotTrial]
     with_events: frozenset[str]
     checksum: str
@@ -82,7 +82,7 @@ class PilotSlides:
         return statistics(slides, self.with_events, guess)
 
 
-def read_pilot(store: Store, item: Collected) -> PilotSlides:
+def read_pilot(store: TrialStore, item: Collected) -> PilotSlides:
     """Read the labelled slides of a campaign.
 
     Raises:
@@ -90,7 +90,7 @@ def read_pilot(store: Store, item: Collected) -> PilotSlides:
     """
     check_level(item)
     labels = Derived.of(store, "labels", item.name)
-    parts: dict[bool, list[Trial]] = {True: [], False: []}
+    parts: dict[bool, list[PlannedTrial]] = {True: [], False: []}
     slides, sums = {}, hashlib.sha256()
     for trial, recording in item.trials:
         slide = read_slide(item, labels, trial, recording)
@@ -147,7 +147,7 @@ def check_level(item: Collected) -> None:
 
 
 def read_slide(
-    item: Collected, labels: Derived, trial: Trial, recording: Recording
+    item: Collected, labels: Derived, trial: PlannedTrial, recording: Recording
 ) -> PilotTrial | None:
     """Read a trial as arrays; None where its motion is no straight slide.
 
@@ -166,7 +166,7 @@ def read_slide(
     return pilot_trial(slide, recording, places)
 
 
-def event_trials(fitted: Sequence[Trial]) -> frozenset[str]:
+def event_trials(fitted: Sequence[PlannedTrial]) -> frozenset[str]:
     """Return ids of trials, spread over all, whose events are read."""
     chosen = np.unique(np.linspace(0, len(fitted) - 1, EVENT_TRIALS).round().astype(int))
     return frozenset(fitted[k].id for k in chosen)
@@ -175,7 +175,7 @@ def event_trials(fitted: Sequence[Trial]) -> frozenset[str]:
 def simulate_pilot(
     rig: RigFile,
     plan: Plan,
-    trials: Sequence[Trial],
+    trials: Sequence[PlannedTrial],
     seed: int,
     with_events: bool = True,
     with_faults: bool = False,

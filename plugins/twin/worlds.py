@@ -28,7 +28,7 @@ from sliplab.plugins.twin.pilot import PilotTrial
 from sliplab.plugins.twin.pilots import LEVEL, ZEROS_MM, simulate_pilot
 from sliplab.plugins.twin.posterior import Bank
 from sliplab.plugins.twin.statistics import VERSION, SlideStatistics, of_names, statistics
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
@@ -50,7 +50,7 @@ class Slides:
     """
 
     plan: Plan
-    trials: tuple[Trial, ...]
+    trials: tuple[PlannedTrial, ...]
     with_events: frozenset[str]
 
 

@@ -33,7 +33,7 @@ _NO_IMAGES: U8 = np.empty((0, 0, 0), np.uint8)
 
 
 @dataclass(frozen=True)
-class Taken:
+class NewFrames:
     """Frames since the last call, and the camera's state.
 
     Attributes:
@@ -108,12 +108,12 @@ class Capture:
         with self._lock:
             self._region = None
 
-    def take(self) -> Taken:
+    def take(self) -> NewFrames:
         """Return the frames since the last call, and the state."""
         with self._lock:
             frames = list(self._ready)
             self._ready.clear()
-            return Taken(
+            return NewFrames(
                 np.stack([image for image, *_ in frames]) if frames else _NO_IMAGES,
                 np.array([number for _, number, _ in frames], np.int64),
                 np.array([host_ns for *_, host_ns in frames], np.int64),

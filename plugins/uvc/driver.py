@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sliplab.plugins.uvc.capture import Taken
+from sliplab.plugins.uvc.capture import NewFrames
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
@@ -65,7 +65,7 @@ class UvcCamera:
         self.stamping = VideoStamping("host arrival", "host arrival")
         self._size = settings.width_px, settings.height_px
         self._running = False
-        self._last: Taken | None = None
+        self._last: NewFrames | None = None
         self._fault: RigError | None = None
         self._process = of_device(
             DEVICE,
@@ -155,7 +155,7 @@ class UvcCamera:
         images, none = np.empty((0, height, width), np.uint8), np.empty(0, np.int64)
         if self._fault is not None:
             raise self._fault
-        taken: Taken = self._call("take")
+        taken: NewFrames = self._call("take")
         self._last = taken
         if not len(taken.number):
             if self._running and (why := self._why_silent(taken)) is not None:
@@ -165,7 +165,7 @@ class UvcCamera:
         sync = np.zeros(len(taken.number), np.uint8)
         return FrameChunk(taken.images, taken.number, taken.host_ns, taken.host_ns, sync)
 
-    def _why_silent(self, taken: Taken) -> str | None:
+    def _why_silent(self, taken: NewFrames) -> str | None:
         if taken.fault is not None:
             return taken.fault
         limit_s = self.settings.stall_s if taken.received else self.settings.first_frame_s

@@ -55,12 +55,12 @@ from sliplab.storage.streams import (
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 APPLICATION = "sliplab"
 
 
-def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
+def find(store: TrialStore, trial: str, campaign: str | None = None) -> Subject:
     """Find the committed trial of this id.
 
     Raises:
@@ -213,7 +213,7 @@ COUNTS = "counts"
 class Subject:
     """The trial to view."""
 
-    store: Store
+    store: TrialStore
     item: Collected
     recording: Recording
 

@@ -38,9 +38,9 @@ def page(
     """Serve the web page of a store: live view, controls, trials, labels, report, log."""
     from sliplab.flows.running import stopping
     from sliplab.flows.running.orchestration import configure_prefect
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     public = origin(public_url)
     configure_prefect(opened.folder)  # before anything imports Prefect
     from sliplab.plugins.web.pages import serving

@@ -90,10 +90,10 @@ def serve(
     prepare_store(store)
     upcoming_runs(named, found, RUNS)
     from sliplab.plugins.web.server.serve import serve as run
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     run(
-        Store.open(store),
+        TrialStore.open(store),
         str(rig_path(rig).resolve()),
         name or file.name,
         found,

@@ -18,7 +18,7 @@ from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials.derived import Arrays, Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import ReviewedOnsets
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SPEED_S = 0.2
 """Interval over which the tool's speed is measured."""
@@ -94,7 +94,7 @@ class ShownTrial:
         return np.empty((0, 2)) if self.xy_px is None else self.xy_px[index]
 
 
-def load_trial(store: Store, item: Collected, trial: str) -> ShownTrial:
+def load_trial(store: TrialStore, item: Collected, trial: str) -> ShownTrial:
     """Read the displayed data of a trial; frames are read later, one at a time.
 
     Raises:

@@ -87,7 +87,7 @@ FINGERS_POLL_S = 0.002
 FORCE = "force"
 """Name of the force sensor's stream."""
 _MOVE_GRACE_S = 10.0
-_END_S = 0.5
+_POSE_SETTLE_S = 0.5
 """Longest time for the pose to show the end of a path that was reported as finished."""
 _TURN_DEG = 1.0
 """Turn of the tool from which the weight of the tool may show in a force sensor."""
@@ -345,14 +345,14 @@ class Rig:
                     path.append(self._segment(times, began, course.at, speed))
             truth = None
             if self.simulation is not None:
-                hold = next(times.start_ns for times, retained in steps if retained)
+                hold = next(times.start_ns for times, recorded in steps if recorded)
                 truth = self.simulation.truth(reference, hold)
             return TrialRun(
                 tuple(steps), self.plate_frame.zero_mm, truth, tuple(path), course.pressed_mm
             )
 
     @property
-    def _often(self) -> bool:
+    def _watches_closely(self) -> bool:
         """Return True if forces and poses are checked every `force_watch.POLL_S`.
 
         Not on a simulated rig without a limit of force, where an overload breaks nothing.
@@ -410,7 +410,7 @@ class Rig:
         """
         begin = self.pose()
         unzeroed = not self._zeroed and self.force is not None and self.force.zeroing == "trial"
-        if self._often and self.force is not None and (self._forces is None or unzeroed):
+        if self._watches_closely and self.force is not None and (self._forces is None or unzeroed):
             self._watch_forces(turns=angle_deg(begin, segment.to) > _TURN_DEG)
         self._send(segment, begin)
         try:
@@ -447,7 +447,7 @@ class Rig:
         closed_mm = max(self.grip_opening_mm - opening_mm, 0.0)
         if closed_mm > self._closed_mm:
             self.guard.check_depth(self.position().depth_mm + closed_mm, "gripper")
-        if self._often and self.force is not None and self._forces is None:
+        if self._watches_closely and self.force is not None and self._forces is None:
             self._watch_forces()
         gripper.move(opening_mm, speed_mm_s, force_n)
         self._fingers_mm = opening_mm
@@ -459,7 +459,7 @@ class Rig:
             out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
             self.move(Move("home", home, out_mm_s), self.position(), None)
             self._open_fingers()
-            if self._often:
+            if self._watches_closely:
                 self._zero_forces()
             for _ in range(times):
                 deep = Position(0.0, 0.0, depth_mm)
@@ -721,7 +721,7 @@ class Rig:
         Raises:
             ArmFault: it is not.
         """
-        deadline = self.clock.now_ns() + round(_END_S * 1e9)
+        deadline = self.clock.now_ns() + round(_POSE_SETTLE_S * 1e9)
         while not is_near(here := self.pose(), segment.to):
             if self.clock.now_ns() > deadline:
                 off = f"{distance_mm(here, segment.to):.1f} mm, {angle_deg(here, segment.to):.1f}"
@@ -747,11 +747,11 @@ class Rig:
 
     def _pass(self, seconds: float, sink: Sink | None) -> None:
         """Let time pass; forces and the arm's pose are checked meanwhile and at its end."""
-        resting = self._resting if self._often else None
+        resting = self._resting if self._watches_closely else None
         if self._forces is None and self._motion is None and resting is None:
             self.clock.wait(seconds)
             return
-        most_s = force_watch.POLL_S if self._often else seconds
+        most_s = force_watch.POLL_S if self._watches_closely else seconds
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
             self.clock.wait(min(most_s, left / 1e9))
@@ -788,7 +788,7 @@ class Rig:
         self.arm.read_pulses()
         if self._forces is not None:
             self._forces.start()
-        elif self.force is not None and self._often:
+        elif self.force is not None and self._watches_closely:
             self._watch_forces()
         elif self.force is not None:
             self.force.start()
@@ -895,7 +895,7 @@ class Rig:
         if self.force.zeroing == "trial":
             self.force.zero()
             self._zeroed = True
-        if self._often:
+        if self._watches_closely:
             self._watch_forces()
 
     def _open_fingers(self) -> None:
@@ -1038,7 +1038,7 @@ class Rig:
             if self._twisted:  # straight out with its present rotation; it turns back once clear
                 pose = replace(pose, rotvec_deg=begin.rotvec_deg)
             blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
-            if self.force is not None and self._often and not blind:
+            if self.force is not None and self._watches_closely and not blind:
                 with suppress(RigError):
                     self._watch_forces(leaving=True)
             self._send(Segment(pose, speed_mm_s), begin)

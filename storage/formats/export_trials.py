@@ -16,7 +16,7 @@ from sliplab.storage.schema.label import LABELS
 from sliplab.storage.streams import EVENTS_KIND, Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def export_trials(
@@ -82,7 +82,7 @@ def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
     }
 
 
-def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
+def label_table(store: TrialStore, campaign: str, trials: list[str]) -> pd.DataFrame:
     """Return one row a labelled trial: the single values of its label, times in integer ns.
 
     Nested values become columns with a dot in their names; lists are left out. Values that are not

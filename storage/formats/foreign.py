@@ -25,7 +25,7 @@ from sliplab.storage.streams import (
     ScalarChunk,
     WrenchChunk,
 )
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 OUTSIDE = "events outside of the sensor"
 UNKNOWN_POLARITY = "events with an unknown polarity"
@@ -140,7 +140,9 @@ class ForeignCampaign(Protocol):
 class Restorable(Protocol):
     """A trial of a store that can be committed to another store as it was."""
 
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
+    def restore(
+        self, store: TrialStore, campaign: Campaign, name: str, about: Json
+    ) -> StreamCounts:
         """Commit the trial with its label and clocks.
 
         Args:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sliplab.storage.formats.foreign import ForeignTrial
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 Reader = Callable[[Path, str], ForeignTrial]
 """Reads a file as a trial of the given name.
@@ -50,7 +50,7 @@ class Format:
     read_all: Callable[[Path], Iterator[ForeignTrial]] | None = None
     check: Callable[[Path], None] | None = None
     export: Callable[[Recording, Path, str], dict[str, int]] | None = None
-    publish: Callable[[Path, Store, Campaign, Recording, Iterable[str]], object] | None = None
+    publish: Callable[[Path, TrialStore, Campaign, Recording, Iterable[str]], object] | None = None
     card: str = ""
 
 

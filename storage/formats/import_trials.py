@@ -75,7 +75,7 @@ from sliplab.storage.streams import (
     ScalarChunk,
     TriggerChunk,
 )
-from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, Store
+from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, TrialStore
 from sliplab.storage.trials.writer import TrialWriter
 
 _LONG_GAP_US = 3_600_000_000
@@ -97,7 +97,7 @@ _UNKNOWN = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
 
 
 def import_trials(
-    store: Store,
+    store: TrialStore,
     name: str,
     trials: Iterable[ForeignTrial],
     origin: Path,
@@ -377,7 +377,7 @@ class _RunsBack(Exception):
 
 
 def _take_whole(
-    store: Store, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
+    store: TrialStore, campaign: Campaign, trial: ForeignTrial, kind: str, salvage: bool
 ) -> tuple[ForeignTrial, _Content]:
     """Commit one trial, or its intact part; return it with what was read."""
     try:
@@ -406,7 +406,7 @@ def _take_whole(
 
 
 @uninterrupted
-def _take(store: Store, campaign: Campaign, trial: ForeignTrial, kind: str) -> _Content:
+def _take(store: TrialStore, campaign: Campaign, trial: ForeignTrial, kind: str) -> _Content:
     """Commit one trial; return what was read."""
     if trial.original is not None:
         about = {"imported": now(), "from": trial.source}

@@ -21,7 +21,7 @@ from sliplab.storage.remote.manifest import objects_folder, read_manifests
 from sliplab.storage.remote.objects import Remote, RemoteError, RemoteMissing, check_url, is_url
 from sliplab.storage.remote.pull import ORIGIN, PullResult, download, origin_of, pull
 from sliplab.storage.trials.checksums import Checksum, incomplete
-from sliplab.storage.trials.store import FORMAT, STORE, Store
+from sliplab.storage.trials.store import FORMAT, STORE, TrialStore
 
 CACHE = "SLIPLAB_CACHE"
 """Environment variable of the folder with all mirrors."""
@@ -37,18 +37,18 @@ def mirror_folder(url: str) -> Path:
     return base.absolute() / f"{name[:40]}-{hash_text(url)[:12]}"
 
 
-def open_store(folder: Path) -> Store:
+def open_store(folder: Path) -> TrialStore:
     """Open the store in `folder`; in a mirror, files are fetched when they are read.
 
     Raises:
-        StoreError: as `Store.open`.
+        StoreError: as `TrialStore.open`.
     """
-    return Store.open(folder, None if origin_of(folder) is None else fetch)
+    return TrialStore.open(folder, None if origin_of(folder) is None else fetch)
 
 
 def open_mirror(
     url: str, on_trial: Callable[[str], None] | None = None
-) -> tuple[Store, PullResult]:
+) -> tuple[TrialStore, PullResult]:
     """Update and return the mirror of `url`, without the big files.
 
     Raises:
@@ -63,7 +63,7 @@ def open_mirror(
     return open_store(folder), done
 
 
-def place_of(store: Store) -> str:
+def place_of(store: TrialStore) -> str:
     """Return the path or URL by which another process, perhaps elsewhere, finds the store."""
     url = origin_of(store.folder)
     if url is not None and store.folder.absolute() == mirror_folder(url):
@@ -71,7 +71,7 @@ def place_of(store: Store) -> str:
     return str(store.folder.resolve())
 
 
-def open_for_trial(place: str, campaign: str, trial: str) -> Store:
+def open_for_trial(place: str, campaign: str, trial: str) -> TrialStore:
     """Open the store at a path or URL for a process that works on one of its trials.
 
     Raises:

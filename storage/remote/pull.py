@@ -46,7 +46,7 @@ from sliplab.storage.trials.checksums import (
     to_fetch,
 )
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import INFO, REGISTRATIONS, Campaign, Store
+from sliplab.storage.trials.store import INFO, REGISTRATIONS, Campaign, TrialStore
 
 ORIGIN = "origin.json"
 """In a store that was pulled: its URL."""
@@ -151,7 +151,7 @@ def pull(
     """
     remote.check()
     listed = remote.campaigns()
-    store = Store.create(folder)
+    store = TrialStore.create(folder)
     # or an earlier pull was killed before it stored its origin
     fresh = origin_of(folder) is None and not any((folder / "campaigns").glob("*"))
     done = PullResult()

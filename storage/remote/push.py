@@ -27,7 +27,7 @@ from sliplab.storage.remote.manifest import (
 from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError, RemoteMissing
 from sliplab.storage.remote.pull import was_pulled
 from sliplab.storage.trials.checksums import Checksum
-from sliplab.storage.trials.store import AGAIN, INFO, Campaign, Store
+from sliplab.storage.trials.store import AGAIN, INFO, Campaign, TrialStore
 
 OnTrial = Callable[[str], None]
 _TRIES = 2
@@ -83,7 +83,7 @@ class PushOptions:
 
 
 def push(
-    store: Store,
+    store: TrialStore,
     remote: Remote,
     campaigns: Sequence[Campaign] | None = None,
     options: PushOptions | None = None,

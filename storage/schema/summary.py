@@ -139,7 +139,7 @@ class Kinematic(NetworkWindows):
     beside: dict[str, Baseline] = Field(default_factory=dict)
 
 
-class DetectionRule(Part):
+class RuleSettings(Part):
     """The settings of detection that were used."""
 
     smoothing: Int
@@ -156,7 +156,7 @@ class NetworkSummary(Part):
     seed: Int | None
     engine: str
     exact: Bool
-    detection: dict[str, DetectionRule]
+    detection: dict[str, RuleSettings]
     kinematic: NetworkWindows
     gravity: Experiment
     disturbance: Experiment
@@ -356,7 +356,7 @@ class OneCameraSummary(Document):
     gravity: Experiment | None = None
     disturbance: Experiment | None = None
     trials: tuple[TrialOutcome, ...] = ()
-    detection: dict[str, DetectionRule] = Field(default_factory=dict)
+    detection: dict[str, RuleSettings] = Field(default_factory=dict)
     choices: dict[str, RuleChoice | None] = Field(default_factory=dict)
     clocks_us: dict[str, Number]
     """Uncertainty of each device's own clock against the sync box, worst trial, microseconds."""
@@ -380,7 +380,7 @@ class Summary(Document):
     trials: tuple[TrialOutcome, ...]
     references: dict[str, ReferenceSummary] = Field(default_factory=dict)
     labels: LabelSummary
-    detection: dict[str, DetectionRule] = Field(default_factory=dict)
+    detection: dict[str, RuleSettings] = Field(default_factory=dict)
     """By campaign."""
     choices: dict[str, RuleChoice | None] = Field(default_factory=dict)
     """By campaign, what chose the rule; null where the protocol says it."""

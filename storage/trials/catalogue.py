@@ -35,7 +35,7 @@ from sliplab.storage.streams import I64
 from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.hdf5_writer import STREAMS
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import STORE, Campaign, Store, StoreError
+from sliplab.storage.trials.store import STORE, Campaign, StoreError, TrialStore
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -60,7 +60,7 @@ NO_CLOCK = "no_clock"
 """Column of a catalogue with trials some streams of which have no clock: their names."""
 
 
-def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
+def catalogue(store: TrialStore, unreadable: list[str] | None = None) -> pd.DataFrame:
     """One row a committed trial: campaign, id, condition and context, counts, quality.
 
     Conditions and context become columns by name; levels with a unit are numbers, the unit is in
@@ -77,7 +77,7 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
 
 
 def catalogue_so_far(
-    store: Store, unreadable: list[str] | None, within_s: float
+    store: TrialStore, unreadable: list[str] | None, within_s: float
 ) -> tuple[pd.DataFrame, int]:
     """Return the catalogue of what can be read in a time, and the number of trials that are left.
 
@@ -321,7 +321,7 @@ class _CampaignRows:
 
 
 def _rebuilt(
-    store: Store, parts: list[_CampaignRows], known: _Index, began_ns: int
+    store: TrialStore, parts: list[_CampaignRows], known: _Index, began_ns: int
 ) -> tuple[pd.DataFrame, bool]:
     """Return the table from the index and the rows that were read; write it as the index.
 
@@ -478,7 +478,7 @@ def _stamp(path: Path, settled: bool = False) -> str:
     return f"{status.st_ino} {status.st_mtime_ns} {status.st_size}"
 
 
-def _read_index(store: Store) -> _Index | None:
+def _read_index(store: TrialStore) -> _Index | None:
     """Read the index; None if there is none that can be used, or nothing that reads Parquet."""
     if not installed("pyarrow"):
         return None
@@ -507,7 +507,7 @@ def _parse(data: bytes) -> _Index | None:
 
 
 def _write_index(
-    store: Store, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Index
+    store: TrialStore, table: pd.DataFrame, rows: list[Row], sync: list[str], known: _Index
 ) -> bool:
     """Write the index, where it can be written and reads again as it is; False elsewhere."""
     if not installed("pyarrow"):
@@ -540,5 +540,5 @@ def _write_index(
     return True
 
 
-def _path(store: Store) -> Path:
+def _path(store: TrialStore) -> Path:
     return store.folder / "derived" / "catalogue" / "index"

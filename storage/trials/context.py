@@ -16,7 +16,7 @@ from sliplab.protocols.model import COLUMNS
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside, read_json
 from sliplab.storage.trials.journal import Entry, Journal
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 LOG = "log"
 SKIN = "skin"
@@ -39,7 +39,7 @@ class ContextChange(Entry):
     campaigns: tuple[str, ...]
 
 
-def log_journal(store: Store) -> Journal:
+def log_journal(store: TrialStore) -> Journal:
     """Return the journal of notes and changes."""
     return Journal(inside(store.folder / LOG, store.folder))
 
@@ -82,7 +82,7 @@ def unplanned(context: Mapping[str, str], plan: Plan) -> dict[str, str]:
 class LoggedContext:
     """The context of one campaign, read again and again; each entry of the log is read once."""
 
-    store: Store
+    store: TrialStore
     campaign: str
     changes: list[ContextChange] = field(default_factory=list)
     """Those of the campaign, oldest first."""

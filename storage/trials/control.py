@@ -22,7 +22,7 @@ from sliplab.storage.files import read_json, safe_name, write_json, write_new_js
 from sliplab.storage.process import now, user_name
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.journal import Entry, Journal, signature
-from sliplab.storage.trials.store import AGAIN, CAUSE, FORGIVEN, Campaign, Store
+from sliplab.storage.trials.store import AGAIN, CAUSE, FORGIVEN, Campaign, TrialStore
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]
 FOLDER, SKIPPED = "control", "skipped.json"
@@ -51,7 +51,7 @@ class ControlRequest(Entry):
 
 
 def ask(
-    store: Store,
+    store: TrialStore,
     kind: Kind,
     *,
     who: str = "",
@@ -69,7 +69,7 @@ def ask(
     return ControlRequest(number=number, **content)
 
 
-def requests(store: Store) -> list[ControlRequest]:
+def requests(store: TrialStore) -> list[ControlRequest]:
     """Return all requests in order; unreadable ones are left out."""
     journal, found = _journal(store), []
     for number in journal.numbers():
@@ -92,13 +92,13 @@ def requests(store: Store) -> list[ControlRequest]:
     return found
 
 
-def answer(store: Store, request: ControlRequest, did: Json) -> Json:
+def answer(store: TrialStore, request: ControlRequest, did: Json) -> Json:
     """Store the result of a request; an existing answer is not replaced."""
     write_new_json(_answer_path(store, request), {"when": now(), "by": user_name(), "did": did})
     return answered(store, request) or {"did": {}}
 
 
-def answered(store: Store, request: ControlRequest) -> Json | None:
+def answered(store: TrialStore, request: ControlRequest) -> Json | None:
     """Return the answer to a request; None while it is open."""
     try:
         found = read_json(_answer_path(store, request))
@@ -109,12 +109,12 @@ def answered(store: Store, request: ControlRequest) -> Json | None:
     return found if isinstance(found.get("did"), dict) else {"did": {}}
 
 
-def open_requests(store: Store) -> list[ControlRequest]:
+def open_requests(store: TrialStore) -> list[ControlRequest]:
     """Return the requests that have not been carried out yet, in order."""
     return [item for item in requests(store) if answered(store, item) is None]
 
 
-def paused(store: Store) -> ControlRequest | None:
+def paused(store: TrialStore) -> ControlRequest | None:
     """Return the request by which the store is paused, if it is: the last one counts."""
     both = [item for item in requests(store) if item.kind in {"pause", "resume"}]
     return both[-1] if both and both[-1].kind == "pause" else None
@@ -206,9 +206,9 @@ def _reset_attempts(campaign: Campaign, trial: str, by: Json) -> int:
     return count
 
 
-def _journal(store: Store) -> Journal:
+def _journal(store: TrialStore) -> Journal:
     return Journal(store.folder / FOLDER)
 
 
-def _answer_path(store: Store, request: ControlRequest) -> Path:
+def _answer_path(store: TrialStore, request: ControlRequest) -> Path:
     return _journal(store).path(request.number, ".done")

@@ -21,7 +21,7 @@ from sliplab.storage.files import inside, read_json, safe_name, write_bytes, wri
 from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat, Part
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 Arrays = dict[str, npt.NDArray[Any]]
 """Arrays of a result by name."""
@@ -55,7 +55,7 @@ class Derived:
     folder: Path
 
     @staticmethod
-    def of(store: Store, step: str, campaign: str | None = None) -> Derived:
+    def of(store: TrialStore, step: str, campaign: str | None = None) -> Derived:
         """Return the results of `step`; those about single trials are under their campaign."""
         folder = store.folder / "derived" / safe_name(step)
         folder = folder if campaign is None else folder / safe_name(campaign)

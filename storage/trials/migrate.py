@@ -17,12 +17,12 @@ from pathlib import Path
 
 from sliplab.storage.files import make_folder, write_bytes, write_json
 from sliplab.storage.trials.checksums import CHECKSUMS, write_sums
-from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, Store, StoreError
+from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, StoreError, TrialStore
 
-Step = Callable[[Store], None]
+Step = Callable[[TrialStore], None]
 
 
-def _describe_with_sums(store: Store) -> None:
+def _describe_with_sums(store: TrialStore) -> None:
     for campaign in store.campaigns():
         names = (PROTOCOL, RIG, INFO)
         missing = [name for name in names if not (campaign.folder / name).is_file()]
@@ -38,7 +38,7 @@ STEPS: dict[int, Step] = {1: _describe_with_sums}
 """By the format that each begins with."""
 
 
-def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
+def migrate(store: TrialStore, steps: dict[int, Step] | None = None) -> list[int]:
     """Bring a store to the newest format; the caller holds the store's lock.
 
     Args:
@@ -60,12 +60,12 @@ def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
     return passed
 
 
-def retained(store: Store, number: int) -> Path:
+def retained(store: TrialStore, number: int) -> Path:
     """Return the folder with copies of what the migration from a format changed."""
     return store.folder / "before" / f"format-{number}"
 
 
-def _keep(store: Store, number: int) -> None:
+def _keep(store: TrialStore, number: int) -> None:
     folder = retained(store, number)
     if (folder / STORE).exists():
         return  # complete: it is copied last
@@ -76,7 +76,7 @@ def _keep(store: Store, number: int) -> None:
             write_bytes(copy, path.read_bytes())
 
 
-def _changeable(store: Store) -> Iterable[Path]:
+def _changeable(store: TrialStore) -> Iterable[Path]:
     """Yield the files that are neither of a committed trial nor made by analysis."""
     for campaign in store.campaigns():
         for name in (PROTOCOL, RIG, INFO, CHECKSUMS):

@@ -20,7 +20,7 @@ JOURNAL, BEGUN = "journal.jsonl", "begun.json"
 _WAIT_S = 60.0
 
 
-class Journal:
+class PrefixJournal:
     """Appends states to a trial's journal, in a thread that waits for the disk."""
 
     def __init__(self, folder: Path) -> None:

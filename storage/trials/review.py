@@ -16,7 +16,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, safe_name
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.journal import Entry, Journal, signature
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 Verdict = Literal["accept", "adjust", "reject", "reopen"]
 FOLDER = "review"
@@ -81,7 +81,7 @@ class Decision(Entry):
 
 
 def decide(
-    store: Store,
+    store: TrialStore,
     campaign: str,
     trial: str,
     verdict: Verdict,
@@ -127,7 +127,7 @@ def decide(
     raise Overtaken(f"{trial}: there is a newer decision:  {newest}")
 
 
-def history(store: Store, campaign: str, trial: str) -> list[Decision]:
+def history(store: TrialStore, campaign: str, trial: str) -> list[Decision]:
     """Return all decisions about a trial in their order.
 
     Raises:
@@ -137,7 +137,7 @@ def history(store: Store, campaign: str, trial: str) -> list[Decision]:
     return [_read(journal, number) for number in journal.numbers()]
 
 
-def last(store: Store, campaign: str, trial: str) -> Decision | None:
+def last(store: TrialStore, campaign: str, trial: str) -> Decision | None:
     """Return the decision that counts; None if there is none.
 
     Raises:
@@ -148,7 +148,7 @@ def last(store: Store, campaign: str, trial: str) -> Decision | None:
     return _read(journal, numbers[-1]) if numbers else None
 
 
-def counts(store: Store, campaign: str) -> dict[str, int]:
+def counts(store: TrialStore, campaign: str) -> dict[str, int]:
     """Count the decisions of each trial; trials without one are left out."""
     folder = store.folder / FOLDER / safe_name(campaign)
     if not folder.is_dir():
@@ -157,7 +157,7 @@ def counts(store: Store, campaign: str) -> dict[str, int]:
     return {name: count for name, count in found.items() if count}
 
 
-def _journal(store: Store, campaign: str, trial: str) -> Journal:
+def _journal(store: TrialStore, campaign: str, trial: str) -> Journal:
     return Journal(store.folder / FOLDER / safe_name(campaign) / safe_name(trial))
 
 

@@ -48,7 +48,7 @@ from sliplab.storage.trials.checksums import CHECKSUMS, PROVENANCE, Fetch, incom
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.writer import TrialWriter
 
-__all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError"]
+__all__ = ["FORMAT", "SYNC", "Campaign", "StoreError", "TrialStore"]
 
 FORMAT = 2
 """Format that this version writes; `storage.trials.migrate` brings older ones forward."""
@@ -400,7 +400,7 @@ class Campaign:
 
 
 @dataclass(frozen=True)
-class Store:
+class TrialStore:
     """A store on disk.
 
     Attributes:
@@ -412,7 +412,7 @@ class Store:
     fetch: Fetch | None = field(default=None, compare=False, repr=False)
 
     @staticmethod
-    def open(folder: Path, fetch: Fetch | None = None) -> Store:
+    def open(folder: Path, fetch: Fetch | None = None) -> TrialStore:
         """Open an existing store.
 
         Raises:
@@ -441,7 +441,7 @@ class Store:
         for name in _FOLDERS:
             if (folder / name).is_symlink():
                 inside(folder / name, folder)
-        return Store(folder, fetch)
+        return TrialStore(folder, fetch)
 
     @property
     def format(self) -> int:
@@ -466,18 +466,18 @@ class Store:
 
     @staticmethod
     @uninterrupted
-    def create(folder: Path) -> Store:
+    def create(folder: Path) -> TrialStore:
         """Open the store in `folder`; make it if there is none.
 
         Raises:
             NoStore: the folder holds something else.
             StoreError: nothing can be written there.
         """
-        if not Store.exists(folder):
+        if not TrialStore.exists(folder):
             with translated_disk_errors(folder):
                 make_folder(folder)
                 write_json(folder / STORE, {"format": FORMAT})
-        return Store.open(folder)
+        return TrialStore.open(folder)
 
     def campaign(self, name: str) -> Campaign:
         """Return the campaign `name`, which may not exist yet."""
@@ -522,3 +522,7 @@ class Store:
     def simulated(self) -> bool:
         """True if any of it came from a mock rig."""
         return any(bool(campaign.info["simulated"]) for campaign in self.campaigns())
+
+
+Store = TrialStore
+"""Its former name, which plug-ins import."""

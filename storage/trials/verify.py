@@ -48,7 +48,7 @@ from sliplab.storage.trials.store import (
     REGISTRATIONS,
     RIG,
     Campaign,
-    Store,
+    TrialStore,
     known_cause,
 )
 from sliplab.storage.trials.superblock import left_open
@@ -81,7 +81,7 @@ class StoreProblem:
 
 
 def verify(
-    store: Store,
+    store: TrialStore,
     on_trial: Callable[[str], None] | None = None,
     on_mended: Callable[[Path], None] | None = None,
 ) -> list[StoreProblem]:
@@ -108,7 +108,7 @@ def verify(
 
 
 def _campaign(
-    store: Store,
+    store: TrialStore,
     campaign: Campaign,
     on_trial: Callable[[str], None] | None,
     on_mended: Callable[[Path], None] | None,
@@ -134,7 +134,7 @@ def trial_folders(campaign: Campaign) -> list[Path]:
     return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
-def imported_trials(store: Store) -> Iterator[tuple[str, TrialRecord]]:
+def imported_trials(store: TrialStore) -> Iterator[tuple[str, TrialRecord]]:
     """Yield the records of imported and recorded trials, with ``campaign/trial``.
 
     They may be intact, but not all that was recorded, or be used by no later step. Trials that
@@ -204,7 +204,7 @@ def _belongs(name: str, sums: Checksums) -> bool:
     return name in _KNOWN
 
 
-def _description(store: Store, campaign: Campaign) -> list[StoreProblem]:
+def _description(store: TrialStore, campaign: Campaign) -> list[StoreProblem]:
     """Check the campaign's own files."""
 
     def problem(path: Path, what: str, kind: str = DAMAGED) -> StoreProblem:
@@ -454,7 +454,7 @@ def _next(campaign: Campaign) -> str:
     return "the next `sliplab collect`"
 
 
-def _leftovers(store: Store, campaign: Campaign) -> list[StoreProblem]:
+def _leftovers(store: TrialStore, campaign: Campaign) -> list[StoreProblem]:
     """Find unfinished trials, and quarantined ones without a cause."""
     found = []
     folder = campaign.folder / "incoming"
@@ -483,7 +483,7 @@ def _leftovers(store: Store, campaign: Campaign) -> list[StoreProblem]:
     return found
 
 
-def quarantine_damaged(store: Store, problems: list[StoreProblem]) -> list[str]:
+def quarantine_damaged(store: TrialStore, problems: list[StoreProblem]) -> list[str]:
     """Quarantine every committed trial that has a problem; the caller holds the store's lock.
 
     Returns:

@@ -32,7 +32,7 @@ from sliplab.storage.trials.checksums import (
 )
 from sliplab.storage.trials.frame_writer import FrameWriter
 from sliplab.storage.trials.hdf5_writer import OWN_DEVICES, STREAM_NAME, StreamFile
-from sliplab.storage.trials.prefix_journal import Journal, drop_journal
+from sliplab.storage.trials.prefix_journal import PrefixJournal, drop_journal
 
 
 def data_files(folder: Path) -> list[str]:
@@ -105,7 +105,7 @@ class TrialWriter:
             name: (chunks[0].KIND.camera, self._camera_files(name, chunks))
             for name, chunks in cameras.items()
         }
-        self._journal = Journal(folder) if guarded else None
+        self._journal = PrefixJournal(folder) if guarded else None
         self._sealed = False
 
     @property

@@ -12,7 +12,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.schema import trial as schema
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 
 def chunk(t_us: Any, x: Any = 0, y: Any = 0, p: Any = 1) -> EventChunk:
@@ -41,7 +41,7 @@ def foreign_campaign(
         adapter: without `trials` and `streams`, which nothing but the import reads.
         trials: by id; a part without ``span_ns`` gets one second.
     """
-    campaign = Store.create(folder).campaign(name)
+    campaign = TrialStore.create(folder).campaign(name)
     about = {"adapter": 1, "from": "data", "format": "adapter", "when": "2026-11-24T00:00:00Z"}
     info: Any = {"name": name, "simulated": False, "experiment": experiment, "imported": about}
     campaign.update(info, adapter + _FILES, "# No rig.\n")

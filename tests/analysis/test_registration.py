@@ -21,7 +21,7 @@ from sliplab.storage.schema.campaign_end import STOPPING, CampaignEnd
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.control import again, skip
 from sliplab.storage.trials.registration import registrations
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.versions import FIGURES, RECORDING, installed_versions
 from tests.storage.trial_files import FRAME, fail, fill, record
 
@@ -183,7 +183,7 @@ def test_end_by_claims_is_said_of_missing_trials(tmp_path: Path, protocol: Json)
 
 
 def test_earlier_trials_and_attempts_are_listed(tmp_path: Path, protocol: Json) -> None:
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     where = store.campaign("pilot")
     describe(where, protocol)
     one, two, three, *_ = ids(protocol, tmp_path)

@@ -12,7 +12,7 @@ import yaml
 from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import UNFINISHED, verify
 from tests.conftest import ROOT, SMALL
 
@@ -103,7 +103,7 @@ def wrong(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
         if whole.get(name) != files
     ]
     if (store / "store.json").exists():
-        problems = verify(Store.open(store))
+        problems = verify(TrialStore.open(store))
         found += [f"{p.path}: {p.what}" for p in problems if p.kind != UNFINISHED]
     return found
 
@@ -119,7 +119,7 @@ def wrong_at_the_end(
     found = wrong(store, whole)
     there = hashes(store)
     found += [f"{name}: is missing" for name in sorted(whole.keys() - there.keys())]
-    found += [f"{p.path}: {p.what}" for p in verify(Store.open(store))]
+    found += [f"{p.path}: {p.what}" for p in verify(TrialStore.open(store))]
     campaign = store / "campaigns" / NAME
     wanted = {
         "protocol.yaml",

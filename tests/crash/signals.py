@@ -21,7 +21,7 @@ from typing import Any
 from sliplab.flows.running import stopping
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.crash.campaign import NAME, collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.process import live
@@ -245,7 +245,7 @@ def _named(store: Path) -> set[str]:
     """Return the paths that `verify` names."""
     if not (store / "store.json").exists():
         return set()
-    return {problem.path for problem in verify(Store.open(store))}
+    return {problem.path for problem in verify(TrialStore.open(store))}
 
 
 def _unnamed(store: Path) -> list[str]:
@@ -269,7 +269,7 @@ def _forget_unfinished(store: Path, notes: Path) -> None:
 def _repeated(store: Path, notes: Path) -> list[str]:
     """Return trials that were recorded completely more often than they were kept."""
     kept = Counter(path.name for path in (store / "campaigns" / NAME / "trials").iterdir())
-    for item in Store.open(store).campaign(NAME).quarantined():
+    for item in TrialStore.open(store).campaign(NAME).quarantined():
         kept[item["trial"]] += str(item["cause"]).startswith("gate")
     recorded = Counter(notes.read_text().split())
     return [

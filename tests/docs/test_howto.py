@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.docs.blocks import blocks
 from tests.docs.walk import walk
@@ -73,7 +73,7 @@ def test_a_trial_is_read_without_sliplab_as_with_it(tmp_path: Path) -> None:
     (tmp_path / "alone.py").write_text(
         f"{alone}\nnp.savez(sys.argv[2], x=x, y=y, p=p, t=events_ns, poses=poses_ns, xyz=xyz_mm)\n"
     )
-    store = Store.open(older_store(tmp_path / "store"))
+    store = TrialStore.open(older_store(tmp_path / "store"))
     (campaign,) = store.campaigns()
     for recording in campaign.recordings():
         done = subprocess.run(

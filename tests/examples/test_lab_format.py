@@ -14,7 +14,7 @@ from sliplab.storage.formats.export_trials import export_trials
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import export_formats
 from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in, trials_in
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.examples.conftest import EXAMPLES, install
 from tests.plugins.adapters.adapter_streams import BASE
@@ -54,7 +54,7 @@ def test_format_of_another_package_is_imported_and_exported(tmp_path: Path) -> N
     write_aedat4(folder / "d.aedat4")
     assert kind_of(folder) == MIXED
     assert skipped_in(folder, "ticks")[0].file == "d.aedat4"
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     done = import_trials(store, "theirs", trials_in(folder, MIXED), folder, MIXED)
     assert done["imported"] == ["a", "b", "d"]
     assert done["events"] == 20 + COUNT
@@ -73,7 +73,7 @@ def test_cut_file_of_another_package_is_salvaged(tmp_path: Path) -> None:
     file = tmp_path / "a.tick"
     ticks(file)
     file.write_bytes(file.read_bytes()[:-5])
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     with pytest.raises(InputError, match="--salvage imports 9 events up to 1800 us"):
         import_trials(store, "theirs", trials_in(file, "ticks"), file, "ticks")
     found = trials_in(file, "ticks", salvage=True)

@@ -22,7 +22,7 @@ from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import NullSink
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.examples.conftest import EXAMPLES
 from tests.flows.collecting.test_further_streams import session
@@ -81,7 +81,7 @@ def test_recorded_and_verified(taken: Recording) -> None:
     assert set(found) == {"t", "acceleration", "temperature"}
     assert (found["acceleration"] == GRAVITY).all()
     assert found["temperature"].dtype == np.float32
-    assert verify(Store.open(store_of(taken))) == []
+    assert verify(TrialStore.open(store_of(taken))) == []
     with pytest.raises(StoreError, match="no samples 'force'; it has: imu"):
         taken.samples("force")
 
@@ -95,7 +95,7 @@ def test_timed(taken: Recording) -> None:
 
 
 def test_listed(taken: Recording) -> None:
-    store = Store.open(store_of(taken))
+    store = TrialStore.open(store_of(taken))
     trial = open_store(store_of(taken)).trial(taken.folder.name)
     assert trial.streams()["imu"] == "imu"
     assert catalogue(store)["imu_imu"].tolist() == [taken.record.streams["imu"].rows]
@@ -103,7 +103,7 @@ def test_listed(taken: Recording) -> None:
 
 def test_shown(taken: Recording, tmp_path: Path) -> None:
     chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (sliplab[view])")
-    store = Store.open(store_of(taken))
+    store = TrialStore.open(store_of(taken))
     counts = view.save(view.find(store, taken.folder.name), tmp_path / "a.rrd")
     assert counts["imu_imu"] == taken.record.streams["imu"].rows
     shown = {str(chunk.entity_path) for chunk in chunks.RrdReader(tmp_path / "a.rrd").stream()}

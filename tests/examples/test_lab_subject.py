@@ -26,7 +26,7 @@ from sliplab.flows.study import StudyOutcome, searches
 from sliplab.plugins.classes.evaluation import class_evaluation_of
 from sliplab.protocols.plugin import plugins
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer
 from tests.conftest import ROOT
 from tests.examples.conftest import install
@@ -53,7 +53,7 @@ def subject(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("subject")
 def test_command_study_and_section(ran: Ran, tmp_path: Path) -> None:
     shutil.copytree(ran[0][0].store, tmp_path / "store")
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     campaigns = collected(store)
     assert plugins().faults == ()
     before = sections_key(store, campaigns)

@@ -20,7 +20,7 @@ from sliplab_prophesee.evt import Decoded, Evt3Encoder, Header
 
 from sliplab.rigs.core.capabilities import EventCamera, RigError
 from sliplab.storage.streams import EventChunk, PulseChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from sliplab.testing import conformance
 from tests.examples.conftest import Lab, checkout
@@ -373,7 +373,7 @@ def test_the_package_runs_a_campaign(tmp_path: Path) -> None:
     assert (taken["planned"], taken["committed"]) == (4, 1)
     assert taken["simulated"] is True
     assert labelled["done"] == 1
-    store = Store.open(sliplab.folder / "store")
+    store = TrialStore.open(sliplab.folder / "store")
     assert verify(store) == []
     for recording in store.campaign("prophesee").recordings():
         with recording.open() as reader:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 
@@ -45,7 +45,7 @@ def test_simulated_campaigns_and_a_downloaded_set_become_one_archive(
 
     onsets = pd.read_parquet(archive / "onsets.parquet")
     streams = pd.read_parquet(archive / "streams.parquet")
-    trials = {c.name: len(c.committed()) for c in Store.open(archive).campaigns()}
+    trials = {c.name: len(c.committed()) for c in TrialStore.open(archive).campaigns()}
     assert trials == {"pilot": 1, "gravity": 1, "ev-objects": 3}
     # the downloaded set has classes, and no onsets
     assert set(onsets["campaign"]) == {"pilot", "gravity"}

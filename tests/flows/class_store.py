@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.analysis.foreign import commit_foreign
 
 CLASSES = ("ball", "box 2", "box 10", "cup", "pen")
@@ -99,7 +99,9 @@ def add_trial(
     commit_foreign(campaign, name, chunk, origin, (TAXELS, 1), simulated=simulated)
 
 
-def begin_campaign(store: Store, head: Mapping[str, Any], *, simulated: bool = False) -> Campaign:
+def begin_campaign(
+    store: TrialStore, head: Mapping[str, Any], *, simulated: bool = False
+) -> Campaign:
     """Make a campaign that keeps an adapter in place of a protocol."""
     campaign = store.campaign(head["name"])
     about = {"adapter": 1, "from": "data", "format": "adapter"}
@@ -119,14 +121,14 @@ def class_store(
     head: Mapping[str, Any] | None = None,
     *,
     simulated: bool = False,
-) -> Store:
+) -> TrialStore:
     """Make a store with one campaign.
 
     Args:
         trials: of each class, by part of the split.
         head: the adapter's.
     """
-    store = Store.create(folder)
+    store = TrialStore.create(folder)
     head = adapter() if head is None else head
     campaign = begin_campaign(store, head, simulated=simulated)
     rng = np.random.default_rng(1)

@@ -41,7 +41,7 @@ from sliplab.flows.study import StudyOutcome, study  # noqa: E402
 from sliplab.rigs.build import build_rig  # noqa: E402
 from sliplab.rigs.rig_file import RigFile  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
-from sliplab.storage.trials.store import Campaign, Store  # noqa: E402
+from sliplab.storage.trials.store import Campaign, TrialStore  # noqa: E402
 
 Ran = tuple[list[RunRequest], StudyOutcome]
 """What the fixture `ran` gives: the runs of the small study, and how they ended."""
@@ -124,7 +124,7 @@ def tiny() -> dict[str, Any]:
     return data
 
 
-def summary_json(store: Store) -> dict[str, Any]:
+def summary_json(store: TrialStore) -> dict[str, Any]:
     """The last report's numbers, as they stand in the file."""
     return read_json(report_folder(store) / "summary.json")
 
@@ -169,7 +169,7 @@ def requested(folder: Path) -> RunRequest:
 
 def at_rig(run_request: RunRequest, file: RigFile | None = None) -> tuple[TrialCollector, Campaign]:
     """A connected session on the request's rig, or on that of another file."""
-    campaign = describe_campaign(Store.create(run_request.store), run_request)
+    campaign = describe_campaign(TrialStore.create(run_request.store), run_request)
     file = file or run_request.rig
     rig = build_rig(file)
     rig.connect()

@@ -18,7 +18,7 @@ from sliplab.plugins.loopback.rig import loopback_rig
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.conftest import ROOT, SMALL
 from tests.flows.conftest import at_rig, take_all, write
 from tests.rigs.waiting import own_address
@@ -87,7 +87,7 @@ def at_work(
     run_request: RunRequest, stage: Loopback, file: RigFile | None = None
 ) -> Iterator[tuple[TrialCollector, Campaign]]:
     """One session, as the same command begins and ends it: drivers are built anew each time."""
-    campaign = describe_campaign(Store.create(run_request.store), run_request)
+    campaign = describe_campaign(TrialStore.create(run_request.store), run_request)
     rig = loopback_rig(file or run_request.rig, stage)
     try:
         rig.connect()

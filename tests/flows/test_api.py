@@ -20,7 +20,7 @@ from sliplab.flows import api
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.notebook import arguments
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store as TrialStore
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.flows.older import older_store
 from tests.patching import loose

@@ -16,12 +16,12 @@ from sliplab.flows.evaluate import evaluate
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.report import read_summary
 from sliplab.flows.study import study
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.conftest import Ran, summary_json, tiny, tiny_gravity, write
 
 
 @pytest.fixture(scope="module")
-def two_seeds(ran: Ran, tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+def two_seeds(ran: Ran, tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> TrialStore:
     """Slides by consecutive windows and falling plates by overlapping ones; two networks.
 
     The trials and their labels are those of the small study.
@@ -33,11 +33,11 @@ def two_seeds(ran: Ran, tmp_path_factory: pytest.TempPathFactory, rig_path: Path
     plates["analysis"]["detection"] = {"stride_ms": 10}
     files = [write(folder / f"{data['name']}.yaml", data) for data in (slides, plates)]
     study([make_request(file, rig_path, folder / "store") for file in files])
-    return Store.open(folder / "store")
+    return TrialStore.open(folder / "store")
 
 
 @pytest.mark.long
-def test_each_network_is_judged_by_the_chosen_one_s_rule(two_seeds: Store) -> None:
+def test_each_network_is_judged_by_the_chosen_one_s_rule(two_seeds: TrialStore) -> None:
     campaigns = collected(two_seeds)
     found = evaluation_of(two_seeds)
     for model in wanted_models(two_seeds, campaigns):
@@ -56,7 +56,7 @@ def test_each_network_is_judged_by_the_chosen_one_s_rule(two_seeds: Store) -> No
 
 
 @pytest.mark.long
-def test_spikes_of_every_network_are_kept(two_seeds: Store) -> None:
+def test_spikes_of_every_network_are_kept(two_seeds: TrialStore) -> None:
     campaigns = collected(two_seeds)
     assert evaluate(two_seeds, campaigns)["done"] == 0
     kept = evaluation_of(two_seeds)
@@ -76,7 +76,7 @@ def test_spikes_of_every_network_are_kept(two_seeds: Store) -> None:
 
 
 @pytest.mark.long
-def test_the_report_shows_every_network(two_seeds: Store) -> None:
+def test_the_report_shows_every_network(two_seeds: TrialStore) -> None:
     found = evaluation_of(two_seeds)
     summary = read_summary(two_seeds)
     assert summary.gravity.by_seed == found.experiments["gravity"].by_seed
@@ -88,7 +88,7 @@ def test_the_report_shows_every_network(two_seeds: Store) -> None:
 
 def test_one_network_is_not_shown_twice(ran: Ran) -> None:
     (run_request, *_), _ = ran
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     assert "by_seed" not in summary_json(store)["kinematic"]
     page = (store.folder / "report/index.html").read_text()
     assert "every trained network" not in page

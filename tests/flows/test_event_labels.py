@@ -23,11 +23,11 @@ from sliplab.protocols.labelling import Labelling
 from sliplab.storage.schema.label import KINDS, TrialLabel
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 
 
-def take(rig: str, folder: Path, protocol: str = "pilot", **factors: list[float]) -> Store:
+def take(rig: str, folder: Path, protocol: str = "pilot", **factors: list[float]) -> TrialStore:
     """Slides of the pilot at the corners of its grid, on a simulated rig."""
     data = yaml.safe_load((ROOT / "protocols" / f"{protocol}.yaml").read_text())
     for name, values in factors.items():
@@ -35,7 +35,7 @@ def take(rig: str, folder: Path, protocol: str = "pilot", **factors: list[float]
     path = folder / "protocol.yaml"
     path.write_text(yaml.safe_dump(data))
     collect(make_request(path, ROOT / "rigs" / f"{rig}.yaml", folder / "store"))
-    return Store.open(folder / "store")
+    return TrialStore.open(folder / "store")
 
 
 CORNERS = {"depth": [2.4, 3.4], "speed": [0.6, 1.6], "direction": [90.0]}
@@ -49,7 +49,7 @@ def slides(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
 
 
 @pytest.fixture(scope="module")
-def unseen(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """One slide of a rig without a frame camera, not labelled."""
     folder = tmp_path_factory.mktemp("unseen")
     return take("mock_events", folder, depth=[2.8], speed=[1.6], direction=[0.0])
@@ -205,7 +205,7 @@ def test_without_events_everything_is_in_doubt(slides: list[Recording]) -> None:
     assert found.paper.incipient_ns is None
 
 
-def test_the_document_says_that_it_is_from_events(unseen: Store) -> None:
+def test_the_document_says_that_it_is_from_events(unseen: TrialStore) -> None:
     recording = next(iter(unseen.campaign("pilot").recordings()))
     found = label_recording(recording, Labelling())
     document = TrialLabel.model_validate(found.document().to_json())
@@ -220,7 +220,7 @@ def test_the_document_says_that_it_is_from_events(unseen: Store) -> None:
     assert 20.0 < arrays["displacement_px"][-1, 0] < 180.0
 
 
-def test_a_reviewer_sees_the_markers_where_the_event_camera_does(unseen: Store) -> None:
+def test_a_reviewer_sees_the_markers_where_the_event_camera_does(unseen: TrialStore) -> None:
     store = unseen
     (item,) = collected(store)
     trial = item.trials[0][1].trial_id

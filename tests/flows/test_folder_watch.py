@@ -15,7 +15,7 @@ from sliplab.flows.folder_watch import FolderWatch, is_written, watch
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.lock import exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import SLIPLAB, here
 from tests.conftest import ROOT
 from tests.storage.formats.files import lab_hdf5
@@ -93,13 +93,13 @@ def test_a_restart_skips_what_is_there(tmp_path: Path) -> None:
         for _ in range(3):
             watched.look()
         assert watched.imported == expected
-    assert Store.open(tmp_path / "store").campaign("habit").committed() == {"a"}
+    assert TrialStore.open(tmp_path / "store").campaign("habit").committed() == {"a"}
 
 
 def test_another_writer_of_the_store_delays_the_import(tmp_path: Path) -> None:
     watched = _watched(tmp_path)
     lab_hdf5(tmp_path / "in" / "a.h5")
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     watched.look()
     with exclusive(store.folder / STORE_LOCK, "the store"):
         watched.look()

@@ -21,7 +21,7 @@ from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.studies.generalise import run as generalise
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.holdout import HoldoutResult
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import shape_of, summary_json
 
@@ -30,7 +30,7 @@ SEEDS = (5, 6)
 
 
 @pytest.fixture(scope="module")
-def store(own_study: Store) -> Store:
+def store(own_study: TrialStore) -> TrialStore:
     """A copy of the small study, with four trials held out."""
     assert measure_holdout(own_study, collected(own_study), 4, seeds=SEEDS)["done"] == 1
     return own_study
@@ -52,7 +52,7 @@ def test_the_release_s_seeds_stand_nowhere_else() -> None:
     assert not [path for path in files if any(word in path.read_text() for word in words)]
 
 
-def test_its_trials_are_others_on_another_skin(store: Store) -> None:
+def test_its_trials_are_others_on_another_skin(store: TrialStore) -> None:
     item = collected(store)[0]
     run_request = holdout_request(Holdout(store, collected(store), 4, SEEDS))
     assert (
@@ -61,7 +61,7 @@ def test_its_trials_are_others_on_another_skin(store: Store) -> None:
     assert scene_of(run_request.rig).scene.skin.seed == SEEDS[1]
     assert {trial.split for trial in run_request.plan} == {"test"}
     assert not {trial.seed for trial in run_request.plan} & {trial.seed for trial in item.plan}
-    theirs = Store.open(store.folder / "holdout" / "store").campaign(item.name)
+    theirs = TrialStore.open(store.folder / "holdout" / "store").campaign(item.name)
     assert theirs.committed() == run_request.only
     # the study's own campaigns are what they were: nothing trains on these, or chooses by them
     assert [campaign.name for campaign in store.campaigns()] == ["tiny", "tiny_gravity"]
@@ -70,7 +70,7 @@ def test_its_trials_are_others_on_another_skin(store: Store) -> None:
 
 
 def test_it_is_judged_once_a_version_and_written_down(
-    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     campaigns = collected(store)
     first = measure_holdout(store, campaigns, 4, seeds=SEEDS)
@@ -97,7 +97,7 @@ def test_it_is_judged_once_a_version_and_written_down(
     write_json(store.folder / "holdout/results.json", kept)
 
 
-def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None:
+def test_its_figures_stand_beside_those_of_the_test_trials(store: TrialStore) -> None:
     report(store, collected(store))
     summary = summary_json(store)["holdout"]
     kept = read_json(store.folder / "holdout/results.json")
@@ -118,7 +118,7 @@ SHARE = {"high": "float", "low": "float", "n": "int", "share": "float", "trials"
 BY_CLASS = {"gross": "float", "incipient": "float", "no_slip": "float"}
 
 
-def test_the_file_has_these_keys(store: Store) -> None:
+def test_the_file_has_these_keys(store: TrialStore) -> None:
     path = store.folder / "holdout/results.json"
     assert json_text(HoldoutResult.load(path).to_json()) == path.read_text()
     found = shape_of(read_json(path))
@@ -140,13 +140,13 @@ def test_the_file_has_these_keys(store: Store) -> None:
     assert [found[name] for name in numbers] == types
 
 
-def test_a_file_of_another_shape_is_named(store: Store) -> None:
+def test_a_file_of_another_shape_is_named(store: TrialStore) -> None:
     with pytest.raises(StoreError, match=r"holdout/results\.json"):
         HOLDOUT.parse(HoldoutResult, {"rows": []})
 
 
 def test_real_slides_need_a_campaign_of_their_own(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaigns = collected(store)
     monkeypatch.setitem(campaigns[0].info, "simulated", False)

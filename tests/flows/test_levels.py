@@ -14,7 +14,7 @@ from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.trials.checksums import write_sums
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import at_rig, take_all, tiny, tiny_gravity, write
@@ -49,7 +49,7 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
     run_request = make_request(write(folder / "p.yaml", data), rig_path, folder / "store")
     work, campaign = at_rig(run_request)
     take_all(work)
-    assert verify(Store.open(folder / "store")) == []
+    assert verify(TrialStore.open(folder / "store")) == []
     with_plate = run_request.plan.protocol.collection.plate is not None
     (recording,) = campaign.recordings()
     return recording, run_request.rig.frame_bytes(with_plate)

@@ -14,14 +14,14 @@ from sliplab.flows.running import run_records
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import control, review
 from sliplab.storage.trials.review import ReviewedOnsets
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.storage.trial_files import campaign, commit, fail
 
 
 def test_the_log_holds_what_people_and_programs_did(tmp_path: Path) -> None:
     tiny = campaign(tmp_path / "s", "tiny")
-    store = Store.open(tmp_path / "s")
+    store = TrialStore.open(tmp_path / "s")
     commit(tiny, "a")
     fail(tiny, "b", 1)
     control.ask(store, "skip", who="anna", why="worn", campaign="tiny", trials=("b",))
@@ -58,7 +58,7 @@ def test_the_log_holds_what_people_and_programs_did(tmp_path: Path) -> None:
 def test_the_command_prints_the_entries_of_a_campaign(tmp_path: Path) -> None:
     fail(campaign(tmp_path / "s", "tiny"), "b", 1)
     fail(campaign(tmp_path / "s", "other"), "c", 1)
-    add_note(Store.open(tmp_path / "s"), "lunch", who="anna")
+    add_note(TrialStore.open(tmp_path / "s"), "lunch", who="anna")
     found = answer("log", tmp_path / "s", "--campaign", "tiny")["entries"]
     assert [entry["trials"] for entry in found] == [["b"]]
     assert len(answer("log", tmp_path / "s")["entries"]) == 3
@@ -67,7 +67,7 @@ def test_the_command_prints_the_entries_of_a_campaign(tmp_path: Path) -> None:
 
 
 def test_a_damaged_file_is_named_and_hides_no_other(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     add_note(store, "first")
     add_note(store, "second")
     (store.folder / "log" / "000001.json").write_text("{")
@@ -77,7 +77,7 @@ def test_a_damaged_file_is_named_and_hides_no_other(tmp_path: Path) -> None:
 
 
 def test_a_notebook_reads_the_status_and_the_log_and_adds_a_note(tmp_path: Path) -> None:
-    Store.create(tmp_path / "s")
+    TrialStore.create(tmp_path / "s")
     store = sliplab.open_store(tmp_path / "s")
     entry = store.note("new skin", who="anna")
     assert store.log() == [entry]
@@ -85,7 +85,7 @@ def test_a_notebook_reads_the_status_and_the_log_and_adds_a_note(tmp_path: Path)
 
 
 def test_notes_made_at_once_are_all_kept(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda n: add_note(store, str(n)), range(40)))
     assert sorted(int(entry.text) for entry in log_entries(store)) == list(range(40))
@@ -94,11 +94,11 @@ def test_notes_made_at_once_are_all_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "  \n", "x" * (MOST_CHARACTERS + 1)])
 def test_a_note_has_text_of_a_sensible_length(tmp_path: Path, text: str) -> None:
     with pytest.raises(ValueError, match="must"):
-        add_note(Store.create(tmp_path / "s"), text)
+        add_note(TrialStore.create(tmp_path / "s"), text)
 
 
 def test_a_log_outside_of_the_store_is_refused(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     (tmp_path / "elsewhere").mkdir()
     (store.folder / "log").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match="out of the store"):

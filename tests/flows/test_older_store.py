@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer
 from tests.flows.older import older_store
 
@@ -52,6 +52,6 @@ def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
 
 
 def test_its_rig_file_describes_the_same_rig(older: Path) -> None:
-    (campaign,) = Store.open(older).campaigns()
+    (campaign,) = TrialStore.open(older).campaigns()
     rig, _ = load_rig_file(campaign.folder / "rig.yaml")
     assert (rig.name, rig.simulated) == (campaign.info["rig"], True)

@@ -22,7 +22,7 @@ from sliplab.flows.running.console import plain
 from sliplab.flows.study import StudyOutcome, study
 from sliplab.flows.study_ledger import LEFT_OUT
 from sliplab.flows.train import train
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.analysis.report.test_plugin_sections import install
 from tests.conftest import ROOT
 from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
@@ -42,7 +42,7 @@ def rig_with(camera: str, folder: Path) -> Path:
     return write(folder / "rig.yaml", {**rig, "name": f"one-{camera}", "cameras": [camera]})
 
 
-def take(camera: str, folder: Path) -> tuple[Store, StudyOutcome]:
+def take(camera: str, folder: Path) -> tuple[TrialStore, StudyOutcome]:
     """Three slides and two plates, from protocol to report."""
     slides = tiny()
     slides["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
@@ -59,33 +59,33 @@ def take(camera: str, folder: Path) -> tuple[Store, StudyOutcome]:
     path = rig_with(camera, folder)
     requests = [make_request(protocol, path, folder / "store") for protocol in protocols]
     outcome = study(requests, check=2, holdout=3)
-    return Store.open(requests[0].store), outcome
+    return TrialStore.open(requests[0].store), outcome
 
 
 @pytest.fixture(scope="module")
 def studied(
     tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[str], tuple[Store, StudyOutcome]]:
+) -> Callable[[str], tuple[TrialStore, StudyOutcome]]:
     """The study of each camera, made when it is first asked for."""
     return cache(lambda camera: take(camera, tmp_path_factory.mktemp(camera)))
 
 
-Take = Callable[[str], Store]
+Take = Callable[[str], TrialStore]
 
 
 @pytest.fixture
-def taken(studied: Callable[[str], tuple[Store, StudyOutcome]], tmp_path: Path) -> Take:
+def taken(studied: Callable[[str], tuple[TrialStore, StudyOutcome]], tmp_path: Path) -> Take:
     """A copy of a camera's store, to be changed at will."""
 
-    def copied(camera: str) -> Store:
-        return Store.open(shutil.copytree(studied(camera)[0].folder, tmp_path / "store"))
+    def copied(camera: str) -> TrialStore:
+        return TrialStore.open(shutil.copytree(studied(camera)[0].folder, tmp_path / "store"))
 
     return copied
 
 
 @pytest.mark.parametrize("camera", [pytest.param("events", marks=pytest.mark.long), "frames"])
 def test_a_study_with_one_camera_runs_to_its_report(
-    camera: str, studied: Callable[[str], tuple[Store, StudyOutcome]]
+    camera: str, studied: Callable[[str], tuple[TrialStore, StudyOutcome]]
 ) -> None:
     store, outcome = studied(camera)
     states = {row.name: (row.state, row.note) for row in outcome.rows}
@@ -218,7 +218,7 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
     path = rig_with("frames", tmp_path)
     request = make_request(write(tmp_path / "tiny.yaml", slides), path, tmp_path / "store")
     collect(request)
-    store = Store.open(request.store)
+    store = TrialStore.open(request.store)
     campaigns = collected(store)
     label(store, campaigns)
     report(store, campaigns)
@@ -235,7 +235,7 @@ def test_a_report_on_one_camera_shows_reference_trials(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_report_is_made_again_only_when_something_changed(
-    studied: Callable[[str], tuple[Store, StudyOutcome]],
+    studied: Callable[[str], tuple[TrialStore, StudyOutcome]],
 ) -> None:
     store, _ = studied("events")
     assert {each.beyond for each in against(store, store.folder)[0].figures} <= {False, None}

@@ -29,13 +29,13 @@ from sliplab.flows.train import train
 from sliplab.protocols import InputError
 from sliplab.protocols.windows import Windows
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.flows.conftest import summary_json
 
 
 @pytest.fixture
-def store(own_study: Store) -> Store:
+def store(own_study: TrialStore) -> TrialStore:
     return own_study
 
 
@@ -78,7 +78,7 @@ def lab(folder: Path) -> str:
     return f"{folder / 'lab.py'}:network"
 
 
-def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
+def test_the_papers_network_is_judged_by_its_own_rule(store: TrialStore) -> None:
     campaigns = collected(store)
     found = Derived.of(store, STEP).read("preset-paper")
     rules = found["detection"]
@@ -99,16 +99,16 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
 
 @pytest.mark.long
 def test_the_preset_by_itself_is_the_network_that_stood_beside(
-    store: Store, tmp_path: Path
+    store: TrialStore, tmp_path: Path
 ) -> None:
     comparison = Derived.of(store, STEP).read("preset-paper")
     shutil.copytree(store.folder, tmp_path / "store")
-    for item in collected(Store.open(tmp_path / "store")):
+    for item in collected(TrialStore.open(tmp_path / "store")):
         file = item.campaign.protocol_file
         data = yaml.safe_load(file.read_text())
         data["analysis"]["preset"] = "paper"
         file.write_text(yaml.safe_dump(data))
-    alone = Store.open(tmp_path / "store")
+    alone = TrialStore.open(tmp_path / "store")
     campaigns = collected(alone)
     assert train(alone, campaigns)["done"] == 1
     models = alone.folder / "models"
@@ -123,7 +123,7 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
 
 
 @pytest.mark.long
-def test_a_labs_network_is_asked_for_its_counts(store: Store, tmp_path: Path) -> None:
+def test_a_labs_network_is_asked_for_its_counts(store: TrialStore, tmp_path: Path) -> None:
     place, campaigns = lab(tmp_path), collected(store)
     done = here("evaluate", store.folder, "--model", place, "--json")
     assert done.returncode == 0, done.stderr
@@ -152,7 +152,7 @@ def test_a_labs_network_is_asked_for_its_counts(store: Store, tmp_path: Path) ->
     assert "a function of another program" in page
 
 
-def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None:
+def test_a_model_of_this_program_is_judged_as_in_its_store(store: TrialStore) -> None:
     own = Derived.of(store, "evaluation").read("evaluation")
     found = judge_model(store, collected(store), store.folder / "models" / "seed0.pt")
     assert found["accuracy"].to_json() == own["windows"]["accuracy"]
@@ -160,14 +160,14 @@ def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None
     assert Derived.of(store, STEP).read("model-seed0")["trials"] == own["trials"]
 
 
-def test_sinabs_gives_the_counts_of_the_kernels(store: Store) -> None:
+def test_sinabs_gives_the_counts_of_the_kernels(store: TrialStore) -> None:
     path = store.folder / "models" / "seed0.pt"
     fast, slow = (judge_model(store, collected(store), path, how) for how in ("fast", "sinabs"))
     assert slow["accuracy"] == fast["accuracy"]
     assert slow["latency_ms"] == fast["latency_ms"]
 
 
-def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
+def test_what_cannot_be_judged_is_refused(store: TrialStore, tmp_path: Path) -> None:
     campaigns = collected(store)
     with pytest.raises(InputError, match=r"lab\.pt: cannot be read"):
         judge_model(store, campaigns, tmp_path / "lab.pt")

@@ -7,13 +7,13 @@ from pathlib import Path
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.other_rig import other_request
 from sliplab.plugins.simulation.settings import scene_of
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.conftest import Ran
 
 
 def test_only_what_is_asked_for_differs(ran: Ran, tmp_path: Path) -> None:
     (first, _), _ = ran
-    (item,) = collected(Store.open(first.store), [first.campaign])
+    (item,) = collected(TrialStore.open(first.store), [first.campaign])
     change = {"mock": {"scene": {"skin": {"seed": 77}}}}
     run_request = other_request(item, change, tmp_path / "other", most=3)
     assert (run_request.store, run_request.campaign, run_request.most) == (

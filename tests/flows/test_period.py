@@ -14,7 +14,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.running import run_records
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.flows.collecting.test_session import session, short
 from tests.flows.test_status import ended
@@ -23,7 +23,7 @@ from tests.storage.trial_files import fail
 
 def test_a_week_says_what_happened_in_it(tmp_path: Path) -> None:
     work, campaign = session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     work.take(pending_trials(work.plan, campaign))
     now = datetime.now().astimezone()
     since, until = now - timedelta(days=7), now + timedelta(minutes=5)
@@ -77,7 +77,7 @@ def test_wrong_days_are_named(since: str | None, until: str | None, says: str) -
 
 
 def test_the_command_needs_no_analysis(tmp_path: Path) -> None:
-    Store.create(tmp_path / "s")
+    TrialStore.create(tmp_path / "s")
     done = answer("report", tmp_path / "s", "--since", "2026-03-02", "--until", "2026-03-08")
     assert Path(done["page"]).name == "2026-03-02_2026-03-08.html"
     assert done["campaigns"] == []

@@ -15,7 +15,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.networks import STEP, retained
 from sliplab.flows.running.console import plain
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store as TrialStore
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.flows.older import older_store
 

@@ -17,18 +17,18 @@ from sliplab.flows.evaluations import run_evaluation
 from sliplab.flows.store_detectors import detectors_of
 from sliplab.protocols import InputError
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.flows.conftest import Ran
 from tests.patching import loose
 
 
 @pytest.fixture(scope="module")
-def store(ran: Ran) -> Store:
-    return Store.open(ran[0][0].store)
+def store(ran: Ran) -> TrialStore:
+    return TrialStore.open(ran[0][0].store)
 
 
-def test_evaluate_says_that_two_trials_promise_nothing(store: Store) -> None:
+def test_evaluate_says_that_two_trials_promise_nothing(store: TrialStore) -> None:
     before = evaluation_of(store)
     done = run_evaluation(store.folder, None, promise=1.0)
     assert evaluation_of(store) == before, "what is stored stays the same"
@@ -45,13 +45,13 @@ def test_evaluate_says_that_two_trials_promise_nothing(store: Store) -> None:
     assert "promise" not in run_evaluation(store.folder, None)
 
 
-def test_a_promise_that_the_trials_support_is_made(store: Store) -> None:
+def test_a_promise_that_the_trials_support_is_made(store: TrialStore) -> None:
     rows = run_evaluation(store.folder, None, promise=1e5)["promise"]
     assert all(row["promised"] for row in rows)
     assert {row["says"] for row in rows} == {"at most 100000 false alarms an hour, 95 % sure"}
 
 
-def test_the_command_shows_it(store: Store) -> None:
+def test_the_command_shows_it(store: TrialStore) -> None:
     done = here("evaluate", store.folder, "--promise", "1")
     assert done.returncode == 0
     assert "hmm counts" in done.stdout
@@ -61,7 +61,7 @@ def test_the_command_shows_it(store: Store) -> None:
     assert json.loads(wrong.stdout)["error"]["key"] == "--promise"
 
 
-def test_detect_has_the_same_levels(store: Store) -> None:
+def test_detect_has_the_same_levels(store: TrialStore) -> None:
     rows = {
         row["detector"]: row for row in run_evaluation(store.folder, None, promise=30)["promise"]
     }
@@ -93,11 +93,15 @@ class SeesTheSlip(Detector):
         return Evidence.of(t_us, np.where(t_us < still_us, 1.0, 9.0))
 
 
-def test_an_alarm_before_the_label_is_false_only_while_surely_nothing_slips(store: Store) -> None:
+def test_an_alarm_before_the_label_is_false_only_while_surely_nothing_slips(
+    store: TrialStore,
+) -> None:
     assert fitted_to(store, SeesTheSlip()).level == 1.0
 
 
-def test_a_calibrated_detector_is_judged_on_stored_trials(store: Store, document: Path) -> None:
+def test_a_calibrated_detector_is_judged_on_stored_trials(
+    store: TrialStore, document: Path
+) -> None:
     done = run_evaluation(store.folder, None, model=document)
     assert done["trials"] == 2
     assert done["simulated"]

@@ -23,7 +23,7 @@ from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer
 from tests.flows.older import older_store
 from tests.flows.test_levels import kinematic, label, take
@@ -50,7 +50,7 @@ analysis:
 """
 
 
-def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
+def other_labs_folder(store: TrialStore, item: Collected, folder: Path) -> None:
     """Write the data set: events as AEDAT4, and a table with what belongs to each trial."""
     files = answer("export", store.folder, item.name, "--output", folder)["files"]
     (folder / "sliplab-export.json").unlink()
@@ -80,7 +80,7 @@ def other_labs_folder(store: Store, item: Collected, folder: Path) -> None:
 
 @pytest.mark.long
 def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
-    here = Store.open(older_store(tmp_path / "here"))
+    here = TrialStore.open(older_store(tmp_path / "here"))
     (item,) = collected(here)
     other_labs_folder(here, item, tmp_path / "theirs")
     (tmp_path / "adapter.yaml").write_text(ADAPTER)
@@ -93,7 +93,7 @@ def test_slides_of_another_lab_go_through_every_step(tmp_path: Path) -> None:
         assert answer(step, there)["done"] > 0
         assert answer(step, there)["done"] == 0
 
-    store = Store.open(there)
+    store = TrialStore.open(there)
     (foreign,) = collected(store)
     assert [trial.split for trial, _ in foreign.trials] == [
         trial.split for trial, _ in sorted(item.trials, key=lambda t: t[0].id)
@@ -166,8 +166,8 @@ def test_our_own_rules_label_the_frames_of_another_lab(tmp_path: Path) -> None:
     there = tmp_path / "there"
     answer("import", "--adapter", tmp_path / "adapter.yaml", tmp_path / "theirs", "--store", there)
     assert answer("label", there)["done"] == 1
-    (foreign,) = collected(Store.open(there))
-    found = Derived.of(Store.open(there), LABELS, foreign.name).load("a", TrialLabel)
+    (foreign,) = collected(TrialStore.open(there))
+    found = Derived.of(TrialStore.open(there), LABELS, foreign.name).load("a", TrialLabel)
     assert (found.rule, found.source) == ("paper", "video")
     assert found.incipient_ns == mine.onsets.incipient_ns
     assert found.gross_ns == mine.onsets.gross_ns

@@ -34,7 +34,7 @@ from sliplab.plugins.studies.section import tradeoff_section
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.evaluation import Seeds, SeedScores, SeedTimes, TrialScore
 from sliplab.storage.schema.summary import ReferenceTrial, Summary
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.analysis.report.test_plugin_sections import install
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
@@ -52,16 +52,16 @@ UNITLESS = re.compile(
 
 
 @pytest.fixture(scope="module")
-def store(own_study: Store) -> Store:
+def store(own_study: TrialStore) -> TrialStore:
     """A copy of the small study, with its report."""
     report(own_study, collected(own_study))
     return own_study
 
 
 @pytest.fixture
-def copied(store: Store, tmp_path: Path) -> Store:
+def copied(store: TrialStore, tmp_path: Path) -> TrialStore:
     """A copy of it, to be changed at will."""
-    return Store.open(shutil.copytree(store.folder, tmp_path / "store"))
+    return TrialStore.open(shutil.copytree(store.folder, tmp_path / "store"))
 
 
 def changed(of: Any, **values: Any) -> Any:
@@ -69,11 +69,11 @@ def changed(of: Any, **values: Any) -> Any:
     return of.model_copy(update=values)
 
 
-def page(store: Store) -> str:
+def page(store: TrialStore) -> str:
     return (store.folder / "report" / "index.html").read_text()
 
 
-def test_every_trial_is_counted_once(store: Store) -> None:
+def test_every_trial_is_counted_once(store: TrialStore) -> None:
     summary = read_summary(store)
     for experiment, planned in (("kinematic", 2), ("gravity", 2), ("disturbance", 0)):
         found = getattr(summary, experiment)
@@ -88,14 +88,14 @@ def test_every_trial_is_counted_once(store: Store) -> None:
     assert least == summary.gravity.lead_ms.min
 
 
-def test_a_summary_is_read_and_written_to_the_byte(store: Store) -> None:
+def test_a_summary_is_read_and_written_to_the_byte(store: TrialStore) -> None:
     path = store.folder / "report" / "summary.json"
     assert json_text(Summary.load(path).to_json()) == path.read_text()
     known = Summary.load(path).model_fields_set
     assert known == set(Summary.model_fields)
 
 
-def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
+def test_trials_that_were_not_judged_are_told_apart(store: TrialStore) -> None:
     campaigns = collected(store)
     rows = evaluation_of(store).trials
     others = [trial_outcome(row) for row in rows if row.campaign != "tiny"]
@@ -148,7 +148,7 @@ def test_what_became_of_a_trial() -> None:
     assert found.lead_ms.mean == pytest.approx([950 - half, 950 + half])
 
 
-def test_trials_stand_under_their_conditions(store: Store) -> None:
+def test_trials_stand_under_their_conditions(store: TrialStore) -> None:
     campaigns = collected(store)
     rows = evaluation_of(store).trials
     found = outcomes.Conditions(campaigns, rows, "gravity")
@@ -172,7 +172,7 @@ DRAWN = (
 )
 
 
-def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
+def test_figures_stand_beside_the_page_with_their_data(store: TrialStore) -> None:
     folder = store.folder / "report"
     text = page(store)
     names = re.findall(r'<figure id="([^"]+)">', text)
@@ -198,7 +198,7 @@ def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
 
 @pytest.mark.long
 def test_sections_of_other_packages_stand_in_the_report(
-    installed: Any, copied: Store, tmp_path: Path
+    installed: Any, copied: TrialStore, tmp_path: Path
 ) -> None:
     install(installed, tmp_path, "lab_rubs")
     install(installed, tmp_path, "lab_bad", ('"rubs"', '"bad"'), ("return Rubs()", "return 1 / 0"))
@@ -214,7 +214,7 @@ def test_sections_of_other_packages_stand_in_the_report(
     assert data.read_text().splitlines() == ["force (N),simulated", "1,yes", "2,yes"]
 
 
-def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
+def test_every_address_in_the_page_is_beside_it(store: TrialStore) -> None:
     folder = store.folder / "report"
     text = page(store)
     assert not re.search(r"<(script|img|iframe|link rel=.stylesheet)", text)
@@ -231,7 +231,7 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
         assert said in text
 
 
-def test_only_the_papers_preset_brings_the_papers_figures(store: Store) -> None:
+def test_only_the_papers_preset_brings_the_papers_figures(store: TrialStore) -> None:
     summary = read_summary(store)
     known = paper_section(summary)
     assert known is not None
@@ -246,7 +246,7 @@ def test_only_the_papers_preset_brings_the_papers_figures(store: Store) -> None:
     assert paper_section(changed(summary, networks={})) is None
 
 
-def test_failures_have_a_command_that_shows_them(store: Store) -> None:
+def test_failures_have_a_command_that_shows_them(store: TrialStore) -> None:
     first = read_summary(store).trials[0]
     row = changed(first, trial="a=1,r=1", outcome="late", gross="missed")
     early = changed(row, outcome="detected_first", gross="false_early", campaign="b")
@@ -289,7 +289,7 @@ def detector() -> Json:
 
 
 @pytest.mark.long
-def test_results_of_other_programs_are_taken_up(copied: Store) -> None:
+def test_results_of_other_programs_are_taken_up(copied: TrialStore) -> None:
     other = copied
     skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81}
     skin["recall"] = {"no_slip": 0.8, "incipient": 0.8, "gross": None}
@@ -335,7 +335,7 @@ def test_results_of_other_programs_are_taken_up(copied: Store) -> None:
     assert list(data.iterdir()) == []  # an older report's figures go
 
 
-def test_an_evaluation_of_another_version_is_refused_by_name(copied: Store) -> None:
+def test_an_evaluation_of_another_version_is_refused_by_name(copied: TrialStore) -> None:
     path = copied.folder / "derived" / "evaluation" / "evaluation.json"
     write_json(path, {**read_json(path), "format": [1, 1]})
     with pytest.raises(StoreError, match=r"another version.*sliplab evaluate"):
@@ -343,7 +343,7 @@ def test_an_evaluation_of_another_version_is_refused_by_name(copied: Store) -> N
 
 
 @pytest.mark.long
-def test_an_evaluation_without_figures_by_each_onset_is_shown(copied: Store) -> None:
+def test_an_evaluation_without_figures_by_each_onset_is_shown(copied: TrialStore) -> None:
     older = copied
     path = older.folder / "derived" / "evaluation" / "evaluation.json"
     kept = read_json(path)
@@ -385,7 +385,7 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     data["collection"]["maintenance"]["rezero"]["touches"] = 3
     run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
     collect(run_request)
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     (item,) = collected(store)
     before = campaign.reference_trials(store, item)
     assert [row.first_slip_ms for row in before] == [None, None]
@@ -418,7 +418,7 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     assert "more than chance." in said
 
 
-def test_scores_have_every_trial_with_its_condition(store: Store) -> None:
+def test_scores_have_every_trial_with_its_condition(store: TrialStore) -> None:
     opened = sliplab.open_store(store.folder)
     scores = opened.scores()
     outcomes = scores[scores.figure == "outcome.detected_first"]
@@ -435,7 +435,7 @@ def test_scores_have_every_trial_with_its_condition(store: Store) -> None:
     pd.testing.assert_series_equal(both.value, both.value_reported, check_names=False)
 
 
-def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:
+def test_a_report_against_itself_differs_in_nothing(store: TrialStore) -> None:
     summary = read_summary(store)
     found = compare(summary, copy.deepcopy(summary))
     assert found.settings == []
@@ -463,7 +463,7 @@ def gravity_trials(summary: Summary, values: Iterable[Json]) -> Summary:
     return changed(summary, trials=tuple(rows))
 
 
-def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store) -> None:
+def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: TrialStore) -> None:
     summary = read_summary(store)
     rng = np.random.default_rng(1)
     ours, theirs = (
@@ -500,7 +500,7 @@ def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store
     assert {row.name: row for row in compare(ours, theirs).figures}[mean].basis == "trials"
 
 
-def test_compared_medians_count_late_detections(store: Store) -> None:
+def test_compared_medians_count_late_detections(store: TrialStore) -> None:
     lost = {"outcome": "late", "gross": "missed"} | dict.fromkeys(
         ("latency_gross_ms", "latency_incipient_ms", "lead_ms")
     )
@@ -537,7 +537,7 @@ def several_times(summary: Summary, *medians_ms: float) -> Summary:
     return changed(summary, gravity=own)
 
 
-def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store) -> None:
+def test_median_times_are_compared_by_seeds_where_there_are_several(store: TrialStore) -> None:
     summary = read_summary(store)
 
     def figures(ours: tuple[float, ...], theirs: tuple[float, ...]) -> dict[str, Change]:
@@ -562,7 +562,7 @@ def test_median_times_are_compared_by_seeds_where_there_are_several(store: Store
 
 
 @pytest.mark.long
-def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
+def test_against_is_a_page_and_a_command(store: TrialStore, tmp_path: Path) -> None:
     other = tmp_path / "summary.json"
     shutil.copy(store.folder / "report" / "summary.json", other)
     done = here("report", store.folder, "--against", other, "--json")

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.analysis.report.sources import report_folder
 from sliplab.flows.report import against
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser
 from tests.flows.conftest import Ran
 
@@ -38,7 +38,7 @@ def folder(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the small study's report, compared with itself."""
     store = tmp_path_factory.mktemp("page") / "store"
     shutil.copytree(ran[0][0].store, store, ignore=shutil.ignore_patterns("trials"))
-    found = Store.open(store)
+    found = TrialStore.open(store)
     against(found, store)
     return report_folder(found)
 

@@ -16,7 +16,7 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import DATA, PROVENANCE
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.command_line import answer
 from tests.flows.collecting.test_session import session, short
 from tests.flows.collecting.test_watches import with_references
@@ -33,7 +33,7 @@ def ended(campaign: Campaign, trials: Sequence[str], *moments: datetime) -> None
 
 def test_a_store_says_what_is_done_left_excluded_and_by_whom_it_is_held(tmp_path: Path) -> None:
     work, campaign = session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     reader = StatusReader(store)
     trials = [trial.id for trial in work.plan]
     assert reader.read(EVENING).campaigns[0].nights_left is None
@@ -70,7 +70,7 @@ def test_a_store_says_what_is_done_left_excluded_and_by_whom_it_is_held(tmp_path
 
 def test_a_trial_that_is_cut_short_after_it_was_read_counts_no_longer(tmp_path: Path) -> None:
     work, campaign = session(tmp_path, short())
-    reader = StatusReader(Store.open(tmp_path / "store"))
+    reader = StatusReader(TrialStore.open(tmp_path / "store"))
     trials = pending_trials(work.plan, campaign)[:2]
     work.take(trials)
     assert reader.read(EVENING).campaigns[0].committed == 2
@@ -83,7 +83,7 @@ def test_a_trial_that_is_cut_short_after_it_was_read_counts_no_longer(tmp_path: 
 def test_a_damaged_campaign_is_named_and_hides_no_other(tmp_path: Path) -> None:
     _, campaign = session(tmp_path, short())
     campaign.protocol_file.write_text("protocol: [")
-    (item,) = StatusReader(Store.open(tmp_path / "store")).read(EVENING).campaigns
+    (item,) = StatusReader(TrialStore.open(tmp_path / "store")).read(EVENING).campaigns
     assert item.problem is not None
     assert "protocol.yaml" in item.problem
 
@@ -98,13 +98,13 @@ def test_the_drift_of_the_last_reference_trial_is_reported(
     monkeypatch.setattr(
         "sliplab.analysis.references.hold_rate", lambda recording: rates[recording.trial_id]
     )
-    (item,) = StatusReader(Store.open(tmp_path / "store")).read(EVENING).campaigns
+    (item,) = StatusReader(TrialStore.open(tmp_path / "store")).read(EVENING).campaigns
     (drift,) = item.drift
     assert (drift.key, drift.trial, drift.bound_percent) == ("event_rate", references[-1], 20)
     assert drift.percent == pytest.approx(10)
     assert not drift.reaches()
     rates[references[-1]] = float("nan")
-    (item,) = StatusReader(Store.open(tmp_path / "store")).read(EVENING).campaigns
+    (item,) = StatusReader(TrialStore.open(tmp_path / "store")).read(EVENING).campaigns
     assert item.drift[0].percent is None
     assert item.drift[0].reaches()
     assert answer("status", tmp_path / "store")["campaigns"][0]["drift"][0]["percent"] is None

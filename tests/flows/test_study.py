@@ -34,13 +34,13 @@ from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.flows.conftest import Ran, summary_json, tiny, tiny_gravity, write
 
 
-def store_of(ran: Ran) -> Store:
+def store_of(ran: Ran) -> TrialStore:
     """The study's store."""
-    return Store.open(ran[0][0].store)
+    return TrialStore.open(ran[0][0].store)
 
 
 def test_every_step_did_its_work(ran: Ran) -> None:
@@ -68,13 +68,13 @@ def test_labels_of_tracks_are_checked_with_video(ran: Ran, tmp_path: Path) -> No
     shutil.copytree(store_of(ran).folder, run_request.store)
     assert check_required(run_request)
     assert check_labels(run_request, 2)["done"] == 2
-    found = read_check(Store.open(run_request.store))
+    found = read_check(TrialStore.open(run_request.store))
     assert (found.trials, found.simulated) == (2, True)
     incipient = found.model_dump(mode="json")["rules_ms"]["paper"]["incipient"]
     assert incipient["n"] == 2
     assert incipient["max_abs"] < 25.0  # the true onset to within 2.5 frames
     (first, second) = (
-        Store.open(check_folder(run_request)).campaign(run_request.campaign).committed()
+        TrialStore.open(check_folder(run_request)).campaign(run_request.campaign).committed()
     )
     assert {first, second} <= {trial.id for trial in run_request.plan}
     assert check_labels(run_request, 2)["done"] == 0
@@ -346,7 +346,8 @@ def test_the_same_seed_gives_the_same_summary(
     ]
     study(run_requests)
     first, second = (
-        summary_json(Store.open(folder)) for folder in (store_of(ran).folder, tmp_path / "store")
+        summary_json(TrialStore.open(folder))
+        for folder in (store_of(ran).folder, tmp_path / "store")
     )
     for summary in (first, second):
         summary.pop("timing_s")
@@ -362,7 +363,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
 ) -> None:
     whole = (store_of(ran).folder / "models" / "seed0.pt").read_bytes()
     shutil.copytree(store_of(ran).folder, tmp_path / "store")
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     models = store.folder / "models"
     for end in ("pt", "json"):
         (models / f"seed0.{end}").unlink()

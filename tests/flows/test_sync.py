@@ -23,7 +23,7 @@ from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, RECORD
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.flows.conftest import tiny, write
 
@@ -31,7 +31,7 @@ SHIFT_NS = 3_000_000
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> TrialStore:
     """Three slides, taken and not looked at yet."""
     folder = tmp_path_factory.mktemp("sync")
     data = tiny()
@@ -40,15 +40,15 @@ def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
         data["analysis"]["split"][f"{split}_levels"] = {"direction": [level]}
     run_request = make_request(write(folder / "tiny.yaml", data), rig_path, folder / "store")
     collect(run_request)
-    return Store.open(folder / "store")
+    return TrialStore.open(folder / "store")
 
 
-def recordings(store: Store) -> list[Recording]:
+def recordings(store: TrialStore) -> list[Recording]:
     """The store's trials, freshly opened."""
     return list(store.campaign("tiny").recordings())
 
 
-def results(store: Store) -> list[dict[str, Any]]:
+def results(store: TrialStore) -> list[dict[str, Any]]:
     """Return the stored clock fit of every trial."""
     kept = Derived.of(store, "sync", "tiny")
     return [kept.read(recording.folder.name) for recording in recordings(store)]
@@ -66,7 +66,7 @@ def as_if_fitted_worse(recording: Recording) -> None:
     write_json(recording.folder / CHECKSUMS, sums)
 
 
-def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
+def test_a_refit_equals_the_record_and_changes_nothing(store: TrialStore) -> None:
     before = [recording.checksum for recording in recordings(store)]
     result = sync(store, collected(store))
     assert (result["done"], result["fresh"], result["changed"]) == (3, 0, 0)
@@ -83,7 +83,7 @@ def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
     json.dumps(result, allow_nan=False)
 
 
-def test_residuals_are_kept_over_the_time_of_the_trial(store: Store) -> None:
+def test_residuals_are_kept_over_the_time_of_the_trial(store: TrialStore) -> None:
     sync(store, collected(store))
     for recording in recordings(store):
         arrays = Derived.of(store, "sync", "tiny").arrays(recording.folder.name)
@@ -96,7 +96,7 @@ def test_residuals_are_kept_over_the_time_of_the_trial(store: Store) -> None:
             assert 0 < np.abs(residual_us).max() <= most + 1e-9
 
 
-def test_a_second_run_does_nothing(store: Store) -> None:
+def test_a_second_run_does_nothing(store: TrialStore) -> None:
     first = sync(store, collected(store))
     page = Path(first["page"])
     written = page.stat().st_mtime_ns
@@ -110,7 +110,7 @@ def test_a_second_run_does_nothing(store: Store) -> None:
 
 @pytest.mark.long
 def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sync(store, collected(store))
     label(store, collected(store))
@@ -122,7 +122,7 @@ def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
 
 
 @pytest.mark.long
-def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None:
+def test_better_clocks_are_used_and_make_later_steps_stale(store: TrialStore) -> None:
     sync(store, collected(store))
     label(store, collected(store))
     first = recordings(store)[0]
@@ -152,7 +152,7 @@ def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None
 
 
 def test_a_refusal_keeps_the_record_and_is_told(
-    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sync(store, collected(store))
     first = recordings(store)[0]
@@ -175,7 +175,7 @@ def test_a_refusal_keeps_the_record_and_is_told(
     assert sync(store, collected(store))["done"] == 1
 
 
-def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
+def test_what_is_told_of_clocks_is_of_those_in_use(store: TrialStore) -> None:
     first = recordings(store)[0]
     path = Derived.of(store, "sync", "tiny").folder / f"{first.folder.name}.json"
     sync(store, collected(store))
@@ -190,7 +190,7 @@ def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
     write_json(path, kept)
 
 
-def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
+def test_the_page_has_every_figure_and_stands_alone(store: TrialStore) -> None:
     text = Path(sync(store, collected(store))["page"]).read_text()
     titles = ("Residuals over a trial", "Drift over the campaign", "Pulses and frames")
     uncertainty = "Uncertainty of events against frames and arm"
@@ -220,7 +220,7 @@ def test_processors_may_differ_in_the_last_digit() -> None:
     assert not same_clocks(clock, {"grade": "a"})
 
 
-def test_the_command_prints_a_table_and_one_object(store: Store, tmp_path: Path) -> None:
+def test_the_command_prints_a_table_and_one_object(store: TrialStore, tmp_path: Path) -> None:
     done = here("sync", store.folder)
     assert done.returncode == 0
     for word in ("Clocks of tiny (simulated)", "hardware", "events", "sync.html"):
@@ -231,14 +231,14 @@ def test_the_command_prints_a_table_and_one_object(store: Store, tmp_path: Path)
     assert pulses.keys() == {"missed", "late", "spurious"}
     other = here("sync", store.folder, "--campaign", "other")
     assert (other.returncode, "there are tiny" in other.stderr) == (2, True)
-    Store.create(tmp_path / "store")
+    TrialStore.create(tmp_path / "store")
     empty = here("sync", tmp_path / "store")
     assert empty.returncode == 1
     assert "holds no campaign yet; run `sliplab collect` first" in empty.stderr
 
 
 def test_a_campaign_without_trials_has_a_page_that_says_so(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Collected, "trials", [])
     result = sync(store, collected(store))

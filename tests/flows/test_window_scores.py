@@ -20,12 +20,12 @@ from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.train import train
 from sliplab.storage.trials.review import ReviewedOnsets, decide
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.conftest import tiny, write
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> TrialStore:
     """Two campaigns with trials of the same numbers; a person rejected a test trial of the first.
 
     The rejected one is the last of its campaign that has samples to give, so that the next sample
@@ -38,7 +38,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
         data["collection"]["motion"][3]["distance"] = "5 mm"
         data["analysis"]["training"] = {"epochs": 1}
         collect(make_request(write(folder / f"{name}.yaml", data), rig_path, folder / "store"))
-    store = Store.open(folder / "store")
+    store = TrialStore.open(folder / "store")
     campaigns = collected(store)
     label(store, campaigns)
     rejected, recording = list(campaigns[0].of_split("test"))[-1]
@@ -56,7 +56,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
 
 
 @pytest.mark.long
-def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> None:
+def test_a_trial_without_samples_gets_none_of_another_campaign(two: TrialStore) -> None:
     campaigns = collected(two)
     assert [t.index for t, _ in campaigns[0].of_split("test")] == [
         t.index for t, _ in campaigns[1].of_split("test")
@@ -80,7 +80,7 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
 
 @pytest.mark.long
 @pytest.mark.parametrize("margin", [0.0, 2.0])
-def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) -> None:
+def test_windows_and_trials_are_judged_by_one_margin(two: TrialStore, margin: float) -> None:
     """Another margin once changed the detections, and not the margin accuracy beside them."""
     assert evaluate(two, collected(two), margin=margin, reviewed=True)["done"] == 1
     found = evaluation_of(two)
@@ -94,7 +94,7 @@ def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) 
 
 
 @pytest.mark.long
-def test_each_sample_says_its_trial(two: Store) -> None:
+def test_each_sample_says_its_trial(two: TrialStore) -> None:
     """The last window of no slip ends at the onset of its own trial."""
     campaigns = collected(two)
     labels = StoreLabels(two, reviewed=True)

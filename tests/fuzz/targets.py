@@ -118,10 +118,10 @@ def look_through(folder: Path, with_trials: bool = True) -> None:
     from sliplab.storage.errors import StoreError
     from sliplab.storage.trials.catalogue import catalogue
     from sliplab.storage.trials.control import open_requests, paused, skipped
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
     from sliplab.storage.trials.verify import verify
 
-    store = Store.open(folder)
+    store = TrialStore.open(folder)
     if with_trials:
         json.dumps([vars(item) for item in verify(store)], allow_nan=False)
         json.loads(catalogue(store, []).to_json(orient="records"))
@@ -187,7 +187,7 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     from sliplab.storage.formats.foreign import FormatError
     from sliplab.storage.formats.import_trials import import_trials
     from sliplab.storage.formats.recognition import kind_of, trials_in
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
     _read_pickles_here()
     folder = box / "foreign"
@@ -200,7 +200,7 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     try:
         if name.endswith(".mcap"):  # may hold a whole trial of a store
             shutil.rmtree(box / "again", ignore_errors=True)
-            made = Store.create(box / "again")
+            made = TrialStore.create(box / "again")
             salvage = bool(len(data) % 2)
             found = trials_in(where, "mcap", salvage=salvage)
             import_trials(made, "again", found, where, "mcap", salvage=salvage)
@@ -218,10 +218,10 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
 def make_foreign(folder: Path) -> dict[str, bytes]:
     """One small file of each kind, by name."""
     from sliplab.storage.formats.export_trials import export_trials
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
     from tests.storage.formats.files import lab_cells, lab_hdf5
 
-    recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
+    recording = TrialStore.open(folder / "small-store").campaign("c").recording("a,r=1")
     lab_hdf5(folder / "lab.h5")
     found = {"lab.h5": (folder / "lab.h5").read_bytes()}
     with h5py.File(folder / "lab.h5", "r+") as file:
@@ -249,9 +249,9 @@ def _made_mcap(folder: Path) -> dict[str, bytes]:
     from mcap.writer import CompressionType, Writer
 
     from sliplab.plugins.formats.ros.mcap_writer import write_mcap
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    store = Store.open(folder / "small-store")
+    store = TrialStore.open(folder / "small-store")
     campaign = store.campaign("c")
     whole, bare = folder / "whole.mcap", folder / "bare.mcap"
     whole.unlink(missing_ok=True)
@@ -310,9 +310,9 @@ def make_small_store(folder: Path) -> None:
     made.quarantine(commit(made, "d,r=1"), "gate sync_uncertainty")
     made.add_bench_record({"operator": "somebody", "temperature": 21.5})
     store_of = made.folder.parents[1]
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store_of)
+    opened = TrialStore.open(store_of)
     control.answer(opened, control.ask(opened, "pause", who="a"), {"did": "paused"})
     control.ask(opened, "again", who="a", campaign="c", trials=("a,r=1",))
 

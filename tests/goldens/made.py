@@ -14,7 +14,7 @@ import typer
 from sliplab.analysis.report.sources import report_folder
 from sliplab.flows.cli.app import command_line
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import short
@@ -74,7 +74,7 @@ def checksums(folder: Path) -> dict[str, str]:
     answer("collect", protocol, "--rig", "rehearsal", "--store", folder / "store")
     return {
         each.trial_id: each.checksum
-        for campaign in Store.open(folder / "store").campaigns()
+        for campaign in TrialStore.open(folder / "store").campaigns()
         for each in campaign.recordings()
     }
 
@@ -84,7 +84,7 @@ def study_of(store: Path) -> dict[str, Any]:
 
     Numbers have six digits.
     """
-    report = report_folder(Store.open(store))
+    report = report_folder(TrialStore.open(store))
     summary = read_json(report / "summary.json")
     for name in ("timing_s", "versions"):
         summary.pop(name)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.nuisances import MIX, NONE, QUIET_S, SHIPPED
 from sliplab.protocols.program import Dwell, Move, Twist
 from tests.conftest import ROOT
@@ -28,7 +28,7 @@ def edited(folder: Path, change: dict[str, Any] | None = None, **limits: str | N
     return load_plan(folder / "p.yaml")
 
 
-def under(plan: Plan, name: str, strength: int = 100) -> Trial:
+def under(plan: Plan, name: str, strength: int = 100) -> PlannedTrial:
     """The first trial with a nuisance at a strength."""
     names = ("nuisance", "strength")
     found = (t for t in plan if tuple(dict(t.condition)[n] for n in names) == (name, strength))

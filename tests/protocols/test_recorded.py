@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sliplab.protocols import InputError
 from sliplab.protocols.adapter import Adapter
-from sliplab.protocols.recorded import RecordedPlan, RecordedTrial, natural, split_recorded
+from sliplab.protocols.recorded import RecordedPlan, TrialProperties, natural, split_recorded
 from sliplab.protocols.yaml_file import validate
 
 HEAD: dict[str, Any] = {"adapter": 1, "name": "touch", "experiment": "classes"}
@@ -24,10 +24,10 @@ def head(**keys: Any) -> Adapter:
     return Adapter.model_validate({**HEAD, **keys})
 
 
-def trial(name: str, label: str | None = "a", **fields: str) -> RecordedTrial:
+def trial(name: str, label: str | None = "a", **fields: str) -> TrialProperties:
     """A recorded trial of one class."""
     condition = {} if label is None else {"object": label}
-    return RecordedTrial(name, condition, fields, label, 1.0, () if label is None else (label,))
+    return TrialProperties(name, condition, fields, label, 1.0, () if label is None else (label,))
 
 
 @given(st.integers(1, 12), st.integers(1, 30), st.sampled_from([(0.7, 0.15), (0.5, 0.25)]))
@@ -92,7 +92,7 @@ def test_fields_and_parts_that_are_none_are_named() -> None:
 
 def test_a_plan_describes_its_trials_in_natural_order() -> None:
     recorded = tuple(
-        RecordedTrial(f"s{n}", {"speed": f"{n} mm/s", "side": "left"}, {}, None, 2.0)
+        TrialProperties(f"s{n}", {"speed": f"{n} mm/s", "side": "left"}, {}, None, 2.0)
         for n in (10, 9, 1)
     )
     plan = RecordedPlan(Adapter.model_validate({**HEAD, "experiment": "kinematic"}), "a", recorded)

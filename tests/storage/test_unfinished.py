@@ -17,7 +17,7 @@ from sliplab.storage import files
 from sliplab.storage.files import replacing, scratch_folder, temporary_path, write_bytes, write_text
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import push
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.formats.recordings import write_dsec
 from tests.storage.trial_files import campaign, commit, fill
@@ -102,7 +102,7 @@ def test_killed_push_leaves_nothing_after_the_next(tmp_path: Path) -> None:
         commit(where, trial)
         killed("push", tmp_path / "store", url)
         assert list((tmp_path / "shared").rglob("*.tmp"))
-        assert push(Store.open(tmp_path / "store"), Remote(url)).problems == []
+        assert push(TrialStore.open(tmp_path / "store"), Remote(url)).problems == []
         assert not list((tmp_path / "shared").rglob("*.tmp"))
 
 
@@ -177,15 +177,15 @@ def test_what_a_killed_import_left_is_cleared_up_by_the_same_import(tmp_path: Pa
     write_dsec(file)
     import_data(file, store, name="theirs")
     file = file.rename(tmp_path / "two.h5")
-    theirs = Store.open(store).campaign("theirs")
+    theirs = TrialStore.open(store).campaign("theirs")
     writer = theirs.begin("two", None, 100)
     fill(writer)
     writer.abandon()
     (theirs.folder / "checksums.json").unlink()
     by = "the same import, or the next recording,"
-    assert [problem.what for problem in verify(Store.open(store))] == [
+    assert [problem.what for problem in verify(TrialStore.open(store))] == [
         f"is missing; {by} writes it",
         f"is an unfinished trial; {by} quarantines it",
     ]
     assert import_data(file, store, name="theirs")["imported"] == ["two"]
-    assert verify(Store.open(store)) == []
+    assert verify(TrialStore.open(store)) == []

@@ -10,7 +10,7 @@ import numpy as np
 
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.writer import TrialWriter
 
 IDENTITY = {"device_ns": [0], "reference_ns": [0], "drift": [0]}
@@ -85,7 +85,7 @@ def record(trial: str, **changes: Any) -> TrialRecord:
 
 def campaign(folder: Path, name: str = "c") -> Campaign:
     """An empty campaign in a new store."""
-    found = Store.create(folder).campaign(name)
+    found = TrialStore.create(folder).campaign(name)
     found.update({"name": name, "simulated": True}, "protocol: 1\n", "rig: 1\n")
     return found
 

@@ -14,7 +14,7 @@ from sliplab.plugins.alerts.watcher import AlertWatcher
 from sliplab.storage.files import read_json
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.storm.virtual import Host, Notes
 
 LOOKS, CALM_LOOKS, LOOK_S = 40, 20, 1800.0
@@ -41,13 +41,13 @@ def _now(host: Host) -> datetime:
     return datetime.fromtimestamp(host.wall_s, UTC)
 
 
-def _kept(store: Store) -> dict[str, Json]:
+def _kept(store: TrialStore) -> dict[str, Json]:
     """Return the events of the outbox by their files' names."""
     paths = (store.folder / FOLDER).glob("*.json")
     return {path.name: read_json(path) for path in paths if path.name != BEGAN}
 
 
-def watch(store: Store, host: Host, notes: Notes, seed: int, lost: float) -> None:
+def watch(store: TrialStore, host: Host, notes: Notes, seed: int, lost: float) -> None:
     """Look at a store for some hours; each event must reach each receiver, once and in its time."""
     quiet = QuietHours.model_validate({"from": "22:00", "until": "06:00"})
     settings = AlertSettings(to=["simulated"], quiet=quiet, most_per_hour=1)

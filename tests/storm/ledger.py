@@ -21,7 +21,7 @@ from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import FORGIVEN, Campaign, Store
+from sliplab.storage.trials.store import FORGIVEN, Campaign, TrialStore
 from sliplab.storage.trials.verify import content_problems, verify_trial
 from tests.storm.sent import differences, most_events
 from tests.storm.steps import NAME
@@ -494,7 +494,7 @@ class Ledger:
             if now.get(name) != known:
                 raise Wrong("a log is true", f"{name} changed or went")
         self.files = now
-        store = Store.open(self._folder)
+        store = TrialStore.open(self._folder)
         faults: list[str] = []
         entries = log_entries(store, faults)
         if faults:
@@ -518,7 +518,7 @@ class Ledger:
         if not (self._campaign / "campaign.json").exists():
             return
         if self._status is None:
-            self._status = StatusReader(Store.open(self._folder))
+            self._status = StatusReader(TrialStore.open(self._folder))
         found = self._status.read()
         if found.running is not None:
             raise Wrong("nothing is left open", "the store is still held")
@@ -535,7 +535,7 @@ class Ledger:
         by_person = {item["trial"] for item in one.excluded if item["by"] is not None}
         skipped = self._skipped() - there
         # a kill may have come between what was asked and its answer
-        waiting = control.open_requests(Store.open(self._folder))
+        waiting = control.open_requests(TrialStore.open(self._folder))
         half = {trial for each in waiting for trial in each.trials}
         self._waiting = any(each.kind == "again" for each in waiting)
         if by_person - half != skipped - half:
@@ -547,7 +547,7 @@ class Ledger:
 
     def _skipped(self) -> set[str]:
         """Return the trials that were skipped, by the requests and their answers."""
-        store, found = Store.open(self._folder), set[str]()
+        store, found = TrialStore.open(self._folder), set[str]()
         for request in control.requests(store):
             did = ((control.answered(store, request) or {}).get("did") or {}).get("trials", {})
             for trial, text in did.items():

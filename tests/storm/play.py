@@ -23,7 +23,7 @@ from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import push
 from sliplab.storage.trials.control import open_requests
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.crash.campaign import collect, run_request
@@ -186,7 +186,7 @@ class Player:
             disturbing & event.keys() for event in step.get("events", ())
         )
         self._ledger.look(found, how != "killed", calm)
-        if step["do"] == "verify" and (Store.exists(stage.store)):
+        if step["do"] == "verify" and (TrialStore.exists(stage.store)):
             said = {note["found"] for note in found if "found" in note}
             if said != damaged:
                 what = f"names {sorted(said)}, damaged are {sorted(damaged)}"
@@ -253,7 +253,7 @@ class Player:
             raise Wrong("what a message advises works", f"a calm night ended: {how}")
         if (self._stage.folder / "one.h5").exists():  # what an import has left, it clears up
             self._step("end import", {"do": "import"})
-        store = Store.open(self._stage.store)
+        store = TrialStore.open(self._stage.store)
         for request in open_requests(store):
             raise Wrong("requests are carried out", f"request {request.number} is open")
         for problem in verify(store):
@@ -304,7 +304,7 @@ def warm() -> None:
             replace(data, rig=load_rig_file(ROOT / "rigs" / "mock_force.yaml")[0], campaign="b")
         )
         remote = Remote(f"file://{folder / 'remote'}")
-        push(Store.open(data.store), remote)
+        push(TrialStore.open(data.store), remote)
         pull(remote, folder / "pulled")
     entries()
     modules_with_dates()

@@ -38,7 +38,7 @@ from sliplab.flows.status import StatusReader
 from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import push as pushed
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import ACTING, Move, Position
 from sliplab.rigs.build import build_rig
@@ -56,7 +56,7 @@ from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import read_sums
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify_trial
 from tests.patching import put
 from tests.storm.alerts import watch
@@ -180,7 +180,7 @@ class _Listener(SessionListener):
     def __init__(self, notes: Notes, witness: Witness) -> None:
         self._notes, self._witness = notes, witness
 
-    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+    def on_trial_done(self, trial: PlannedTrial, outcome: str) -> None:
         self._notes.add(trial=trial.id, outcome=outcome)
 
     def on_paused(self, why: str) -> None:
@@ -208,7 +208,7 @@ def night(process: Process, step: dict[str, Any]) -> None:
         (event["at_s"], partial(happen, process, event, witness))
         for event in step.get("events", [])
     ]
-    store = Store.create(stage.store)
+    store = TrialStore.create(stage.store)
     refuse_paused(store)
     if control.open_requests(store):
         with store_lock(store):
@@ -280,7 +280,7 @@ def happen(process: Process, event: dict[str, Any], witness: Witness) -> None:
 def _rival(process: Process, witness: Witness) -> None:
     """Let a second program try to get the store."""
     try:
-        with store_lock(Store.open(process.stage.store)):
+        with store_lock(TrialStore.open(process.stage.store)):
             witness.wrong("one program at a time", "a second one got the store's lock")
     except Locked:
         pass
@@ -288,7 +288,7 @@ def _rival(process: Process, witness: Witness) -> None:
 
 def _look(process: Process, witness: Witness) -> None:
     """Hold the status in the middle of a night against the disk."""
-    store = Store.open(process.stage.store)
+    store = TrialStore.open(process.stage.store)
     found = StatusReader(store).read()
     says = found.collects, [(one.campaign, one.committed) for one in found.campaigns]
     there = len([*store.campaign(NAME).folders("trials")])
@@ -297,7 +297,7 @@ def _look(process: Process, witness: Witness) -> None:
 
 
 def _file_request(process: Process, wanted: dict[str, Any]) -> None:
-    store, kind = Store.open(process.stage.store), wanted["ask"]
+    store, kind = TrialStore.open(process.stage.store), wanted["ask"]
     ids = _ids(process, wanted)
     if ids and not store.campaign(NAME).begun:
         return
@@ -316,9 +316,9 @@ def _ids(process: Process, wanted: dict[str, Any]) -> tuple[str, ...]:
 
 def ask(process: Process, step: dict[str, Any]) -> None:
     """Ask for something while no collection runs."""
-    if not Store.exists(process.stage.store):
+    if not TrialStore.exists(process.stage.store):
         return
-    store, ids = Store.open(process.stage.store), _ids(process, step)
+    store, ids = TrialStore.open(process.stage.store), _ids(process, step)
     if ids and not store.campaign(NAME).begun:
         return
     process.notes.add(asks=step["ask"], trials=ids)
@@ -332,13 +332,13 @@ def ask(process: Process, step: dict[str, Any]) -> None:
 
 def log(process: Process, step: dict[str, Any]) -> None:
     """Log a skin, or a note."""
-    if Store.exists(process.stage.store):
+    if TrialStore.exists(process.stage.store):
         _log(process, step)
 
 
 def _log(process: Process, step: dict[str, Any]) -> None:
     """Log a note, or a skin."""
-    store = Store.open(process.stage.store)
+    store = TrialStore.open(process.stage.store)
     context = {"skin": step["skin"]} if "skin" in step else None
     text = f"note at {process.host.wall_s:.0f}"
     if context and not store.campaign(NAME).begun:
@@ -351,7 +351,7 @@ def _log(process: Process, step: dict[str, Any]) -> None:
 
 def check(process: Process, step: dict[str, Any]) -> None:
     """Verify the store: what is damaged is named, and set aside if that is asked for."""
-    if not Store.exists(process.stage.store):
+    if not TrialStore.exists(process.stage.store):
         return
     with stopping.signals():
         found = verify(str(process.stage.store), quarantine=step.get("quarantine", False))
@@ -435,9 +435,9 @@ def take_down(process: Process, step: dict[str, Any]) -> None:
 def carry(process: Process, step: dict[str, Any]) -> None:
     """Export a trial for another program, import that, and compare the events."""
     stage, form = process.stage, step["form"]
-    if not Store.exists(stage.store):
+    if not TrialStore.exists(stage.store):
         return
-    store = Store.open(stage.store)
+    store = TrialStore.open(stage.store)
     names = sorted(store.campaign(NAME).committed())
     if not names:
         return
@@ -552,10 +552,10 @@ def _remote(process: Process, step: dict[str, Any]) -> Remote:
 
 def send(process: Process, step: dict[str, Any]) -> None:
     """Push the store."""
-    if Store.exists(process.stage.store):
+    if TrialStore.exists(process.stage.store):
         options = PushOptions(check=step.get("check", False))
         remote = _remote(process, step)
-        done = push(Store.open(process.stage.store), remote, options=options)
+        done = push(TrialStore.open(process.stage.store), remote, options=options)
         process.notes.add(pushed=done.pushed, problems=len(done.problems), check=options.check)
 
 
@@ -571,14 +571,14 @@ def serve(process: Process, step: dict[str, Any]) -> None:
     """Runs are begun from a page, which gets lost and comes back."""
     from tests.storm.page import serve  # loads Prefect
 
-    if Store.exists(process.stage.store):
+    if TrialStore.exists(process.stage.store):
         serve(process.stage.store, process.notes, step["seed"], step["lost"])
 
 
 def alert(process: Process, step: dict[str, Any]) -> None:
     """Tell people what happens to the store."""
-    if Store.exists(process.stage.store):
-        store = Store.open(process.stage.store)
+    if TrialStore.exists(process.stage.store):
+        store = TrialStore.open(process.stage.store)
         watch(store, process.host, process.notes, step["seed"], step["lost"])
 
 

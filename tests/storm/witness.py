@@ -19,7 +19,7 @@ from sliplab.plugins.simulation.frame_camera import MockFrameCamera
 from sliplab.plugins.simulation.sync import MockSyncBox
 from sliplab.plugins.simulation.thermometer import MockThermometer
 from sliplab.plugins.simulation.world import SimulatedWorld
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core import reacting
 from sliplab.rigs.core.capabilities import ArmState, Segment
@@ -309,7 +309,7 @@ class Witness:
         until = supervisor._run_request.until
         last = max((each.number for each in control.requests(store)), default=0)
 
-        def asked(trial: Trial) -> bool:
+        def asked(trial: PlannedTrial) -> bool:
             may = may_take(trial)
             if not may:
                 return may

@@ -30,7 +30,7 @@ PALETTE = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
 Array = npt.NDArray[Any]
 CLASS_COLOURS = (BLUE, ORANGE, RED)
 ONSET_COLOURS = CLASS_COLOURS[1:]
-"""Of incipient and gross slip."""
+"""Of incipient and gross slip, in labels and, dotted, in detections."""
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
 WIDTH = 6.4
 """Inches: still readable when a telephone shrinks it."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sliplab.analysis.campaigns import Collected
     from sliplab.analysis.report.page import Table
     from sliplab.storage.trials.recording import Recording
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
 RESULT = CommandResult("derived/lab_rates/rates.json", "sliplab rates {store}")
 COLUMNS = ("trial", "hold (1/s)", "motion (1/s)")
@@ -42,13 +42,13 @@ class Rates(Document):
 def measure(store: StoreArgument, campaign: CampaignOption = None) -> Finding[Rates]:
     """Measure event rates before and in the motion of each trial."""
     from sliplab.analysis.campaigns import collected
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     return find(opened, collected(opened, campaign))
 
 
-def find(store: Store, campaigns: Sequence[Collected]) -> Finding[Rates]:
+def find(store: TrialStore, campaigns: Sequence[Collected]) -> Finding[Rates]:
     """Return the rates of the campaigns of a store."""
     found = tuple(
         rate(f"{item.name}/{trial.id}", recording)
@@ -107,7 +107,7 @@ STUDY = Study(
 def search(planned: StudyPlan, run_requests: Sequence[object]) -> Search:
     """Return the study as a step of `sliplab study --searches`."""
 
-    def run(store: Store, campaigns: list[Collected]) -> int:
+    def run(store: TrialStore, campaigns: list[Collected]) -> int:
         found = find(store, campaigns)
         STUDY.write(found)
         return len(found.result.rates)

@@ -35,12 +35,12 @@ from sliplab.flows.store_detectors import store_detectors
 from sliplab.plugins.bench.stress import judging as stress
 from sliplab.plugins.bench.stress.document import StressAccuracy, StressDetector, StressRecord
 from sliplab.plugins.bench.stress.judging import StressTrial
-from sliplab.protocols import InputError, Plan, Trial
+from sliplab.protocols import InputError, Plan, PlannedTrial
 from sliplab.storage.files import make_folder
 from sliplab.storage.schema.evaluation import Rate
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 NAME = "stress"
 
@@ -54,14 +54,18 @@ class StressRequest:
         out: folder of the page and its numbers.
     """
 
-    store: Store
+    store: TrialStore
     campaigns: list[Collected]
     taken: RunRequest
     out: Path
 
 
 def request(
-    store: Store, campaigns: list[Collected], protocol: Path, rig: Path | None, out: Path | None
+    store: TrialStore,
+    campaigns: list[Collected],
+    protocol: Path,
+    rig: Path | None,
+    out: Path | None,
 ) -> StressRequest:
     """Check a request.
 
@@ -149,7 +153,7 @@ def measure_stress(asked: StressRequest) -> StressRecord:
 
 
 def _stress_trial(
-    plan: Plan, trial: Trial, recording: Recording, labels: StoreLabels, campaign: Collected
+    plan: Plan, trial: PlannedTrial, recording: Recording, labels: StoreLabels, campaign: Collected
 ) -> StressTrial | None:
     """A trial with its nuisance and onsets; None where the label lacks the incipient one.
 
@@ -171,12 +175,12 @@ def _stress_trial(
     )
 
 
-Trials = list[tuple[Trial, Recording, StressTrial]]
+Trials = list[tuple[PlannedTrial, Recording, StressTrial]]
 Predicted = list[tuple[StressTrial, Predictions]]
 
 
 def _predicted(
-    disturbed: Store, campaign: Collected, trials: Trials, model: ModelOnDisk, stride_ms: int
+    disturbed: TrialStore, campaign: Collected, trials: Trials, model: ModelOnDisk, stride_ms: int
 ) -> Predicted:
     """Spikes of a network in all windows of the trials."""
     windows = model.settings.windows

@@ -40,7 +40,7 @@ from sliplab.plugins.claims.power.resampling import (
     shared_axes,
 )
 from sliplab.plugins.claims.simulated import claims_of
-from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
 from sliplab.protocols.claims import Claim, Stopping
 from sliplab.protocols.consistency import check_consistency
 from sliplab.protocols.key_errors import KeyedError
@@ -49,7 +49,7 @@ from sliplab.protocols.settings import AnalysisSettings
 from sliplab.protocols.yaml_file import input_error, parse_leniently, raise_all, validate
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 FEWEST = 6
 """Trials of a pilot with a figure."""
@@ -67,7 +67,7 @@ TITLES: Mapping[Classifier, str] = {
     "logistic": "logistic regression on cells and parts of a window",
     "network": "the pilot's network",
 }
-PilotTrial = tuple[Collected, Trial, Recording]
+PilotTrial = tuple[Collected, PlannedTrial, Recording]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PowerRequest:
         classifier: of the learning curve; None: no curve.
     """
 
-    store: Store
+    store: TrialStore
     plan: Plan
     campaigns: list[Collected]
     pilot: list[PilotTrial]
@@ -169,7 +169,7 @@ def read_claim(text: str, plan: Plan) -> Claim:
 
 
 def request(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     plan: Plan,
     model: Path | None,
@@ -213,7 +213,7 @@ def request(
     return PowerRequest(store, plan, used, pilot, judge, count, seed, classifier, sessions)
 
 
-def of_plan(plan: Plan, pilot: Store) -> PowerRecord:
+def of_plan(plan: Plan, pilot: TrialStore) -> PowerRecord:
     """Draw campaigns of a plan by a pilot's trials, without a learning curve.
 
     Raises:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sliplab.analysis.report.page import Table
     from sliplab.flows.planning.plan_view import Forecast
     from sliplab.protocols import Plan
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.store import TrialStore
 
 COLUMNS = ("claim", "trials", "80 %", "holds", "refuted", "open", "repetitions needed")
 TOGETHER = "all claims"
@@ -106,7 +106,7 @@ def measure(
     return Finding(foretell(asked), pilot.folder / "report" if out is None else out)
 
 
-def forecast(plan: Plan, pilot: Store) -> Forecast:
+def forecast(plan: Plan, pilot: TrialStore) -> Forecast:
     """Return what a pilot predicts of a plan's claims, for `sliplab plan`.
 
     Raises:

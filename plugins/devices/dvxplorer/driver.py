@@ -64,7 +64,7 @@ class EventCounts:
 
 
 class OpenedInputs(Protocol):
-    """Opened inputs: an `EventSource`, or an `EventProcess` that has one."""
+    """Opened inputs: a `DvxEventSource`, or an `EventProcess` that has one."""
 
     name: str
     resolution: tuple[int, int]

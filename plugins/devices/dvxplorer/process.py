@@ -34,7 +34,7 @@ _CLOSE_S = 2.0
 
 
 class EventProcess:
-    """A `plugins.devices.dvxplorer.source.EventSource` in a child process.
+    """A `plugins.devices.dvxplorer.source.DvxEventSource` in a child process.
 
     Attributes:
         name: model and serial number, or the name in the stream's header.

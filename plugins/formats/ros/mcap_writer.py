@@ -39,7 +39,7 @@ from sliplab.storage.trials.hdf5_writer import (
     TRACKS,
 )
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, Campaign, TrialStore
 from sliplab.storage.trials.video import frame_rate
 
 if TYPE_CHECKING:
@@ -62,7 +62,11 @@ Message = tuple[int, int, bytes]
 
 
 def write_mcap(
-    path: Path, store: Store, campaign: Campaign, recording: Recording, personal: Iterable[str] = ()
+    path: Path,
+    store: TrialStore,
+    campaign: Campaign,
+    recording: Recording,
+    personal: Iterable[str] = (),
 ) -> dict[str, int]:
     """Write one trial to the new file `path`; the caller makes it visible.
 
@@ -92,7 +96,7 @@ def write_mcap(
 @dataclass
 class _Trial:
     writer: Writer
-    store: Store
+    store: TrialStore
     campaign: Campaign
     recording: Recording
 

@@ -51,7 +51,7 @@ from sliplab.storage.trials.hdf5_writer import (
     TRACKS,
 )
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import content_problems
 from sliplab.storage.trials.writer import TrialWriter
 
@@ -120,7 +120,9 @@ class Original:
         return first.shape[1], first.shape[0]
 
     @uninterrupted
-    def restore(self, store: Store, campaign: Campaign, name: str, about: Json) -> StreamCounts:
+    def restore(
+        self, store: TrialStore, campaign: Campaign, name: str, about: Json
+    ) -> StreamCounts:
         """Commit the trial with its label and clocks; as `Restorable`."""
         writer = campaign.begin(name, self.frame_px(), self.rate_hz)
         try:
@@ -223,7 +225,7 @@ class Original:
         if images is not None and next(images, None) is not None:
             raise FormatError(f"holds more frames than times of frames, {len(t_ns)}")
 
-    def keep_label(self, store: Store, campaign: str, trial: str) -> None:
+    def keep_label(self, store: TrialStore, campaign: str, trial: str) -> None:
         """Write the trial's label, before the trial: no one reads it until the trial exists."""
         if self.label is None:
             return
@@ -233,7 +235,7 @@ class Original:
             write_bytes(saved.arrays_path(trial), self.label_arrays)
         write_json(saved.folder / f"{trial}.json", self.label.to_json())
 
-    def drop_label(self, store: Store, campaign: str, trial: str) -> None:
+    def drop_label(self, store: TrialStore, campaign: str, trial: str) -> None:
         """Delete the label of a trial that was not written."""
         saved = Derived.of(store, LABELS, campaign)
         (saved.folder / f"{trial}.json").unlink(missing_ok=True)

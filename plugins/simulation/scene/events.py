@@ -364,12 +364,12 @@ def trace(
     Args:
         loads, layout_mm, projection: see `marker_path.markers_in_image`.
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
-        camera: `CameraKernel`; phase_ns: of `readout.Scans`.
+        camera: `CameraKernel`; phase_ns: of `readout.ScanTimes`.
         of_pixels, lists: `Pixels` and `RimLists`, written.
         circuit: pixels of `circuit`, which do all signal events where there are any; without them
             their code is not compiled.
         noise: `noise.Candidates`, at least those of this time.
-        light: `flicker.Flicker`, written.
+        light: `flicker.FlickeringLight`, written.
         pending: packed events of scans that were not complete, ns after `row_ns[0]`, less a period
             and the time to read all columns.
 

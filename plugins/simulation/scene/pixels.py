@@ -391,7 +391,7 @@ def events_of_pixels(
         segments: of the blocks, in order, see `marker_path.SEGMENT`.
         first: first row of each block, and the last row of all, (blocks + 1,).
         since, until: when each step begins and ends, ns after the begin of its block.
-        inverse, curve: see `marker_path.fit_block`.
+        inverse, curve: see `marker_path.fit_blocks`.
         steps: when each step begins, one over its length, and its coefficients, (r, 14).
         tree: scratch for `marker_path.bound_rates`; that of block b begins at 4 first[b].
         threshold, state: of all pixels, (height, width) and (height, width, 4); written.

@@ -74,7 +74,7 @@ class Skin:
 
 
 @dataclass(frozen=True)
-class Made:
+class MeasuredGeometry:
     """Measured geometry of n papillae, instead of a drawn one.
 
     Attributes:
@@ -87,7 +87,7 @@ class Made:
     offset_mm: F64
 
 
-def make_skin(geometry: SkinGeometry, seed: int, made: Made | None = None) -> Skin:
+def make_skin(geometry: SkinGeometry, seed: int, made: MeasuredGeometry | None = None) -> Skin:
     """A skin with the fabrication scatter that belongs to `seed`, or with a measured one.
 
     The skin without scatter is the same after a turn by 60 degrees if every ring's count can
@@ -107,7 +107,7 @@ def make_skin(geometry: SkinGeometry, seed: int, made: Made | None = None) -> Sk
         height = np.array(heights) + geometry.height_scatter_mm * rng.uniform(-1.0, 1.0, n)
         wander = np.clip(rng.standard_normal((n, 2)), -2.0, 2.0)
         grip = np.clip(rng.standard_normal(n), -2.0, 2.0)
-        made = Made(
+        made = MeasuredGeometry(
             height, 1.0 + geometry.friction_scatter * grip, geometry.position_scatter_mm * wander
         )
     height = made.height_mm

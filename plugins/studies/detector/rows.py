@@ -290,7 +290,7 @@ def comparisons(rows: Sequence[DetectorRow]) -> list[Json]:
 
     Returns:
         one for each value: ``factor``, ``value``, ``paper``, ``row`` (the place among `rows`), and
-        by figure the differences from the paper's value as `analysis.metrics.paired.Difference`
+        by figure the differences from the paper's value as `paired.PairedDifference`
         has them, with ``told`` where they are significant.
     """
     found = []

@@ -19,13 +19,13 @@ from sliplab.plugins.studies.detector.search import STEP, DetectorSearch, Search
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_text
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 STEM = "detector_tradeoff"
 
 
 def detector_search(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     size: SearchSize,
     axes: Axes,
@@ -48,7 +48,7 @@ def detector_search(
 
 
 def tradeoff_detector(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     folder: Path,
     size: SearchSize,

@@ -37,7 +37,7 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.plugins.studies.detector.grid import NetworkSetting, SettingGrid, counted_stride
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.network_settings import NetworkSettings
 from sliplab.protocols.settings import AnalysisSettings
@@ -97,7 +97,7 @@ class LabelledTrial:
     """A trial with both onsets, its label and the label's key."""
 
     item: Collected
-    trial: Trial
+    trial: PlannedTrial
     recording: Recording
     label: TrialLabel
     label_key: str

@@ -48,7 +48,7 @@ from sliplab.storage.files import make_folder, write_bytes, write_text
 from sliplab.storage.schema.document import Part
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import make_key
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 STEP, FILE, TABLE, VERSION = "generalisation", "results.json", "results.md", 1
 SPLITS = ("train", "validation", "test")
@@ -191,7 +191,9 @@ class Generalisation:
         StoreError: a trial has no label yet.
     """
 
-    def __init__(self, store: Store, campaigns: list[Collected], epochs: int | None = None) -> None:
+    def __init__(
+        self, store: TrialStore, campaigns: list[Collected], epochs: int | None = None
+    ) -> None:
         self.folder = store.folder / "derived" / STEP
         make_folder(self.folder)
         head = {"simulated": store.simulated}
@@ -281,7 +283,7 @@ class Generalisation:
         return make_key(STEP, VERSION, self._inputs, [name, inputs])
 
 
-def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, list[TrialRef]]:
+def all_samples(store: TrialStore, campaigns: list[Collected]) -> tuple[SampleSet, list[TrialRef]]:
     """Return the samples of all parts of the split, and their trials in the samples' order.
 
     Raises:

@@ -27,7 +27,7 @@ from sliplab.plugins.studies.generalise.results import (
     score_windows,
 )
 from sliplab.protocols.errors import InputError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 SKIN_SEEDS = 101
 """Seed of the first other skin."""
@@ -36,7 +36,7 @@ SKINS, TRIALS = 5, 36
 
 
 def measure_generalisation(
-    store: Store,
+    store: TrialStore,
     campaigns: list[Collected],
     factors: Sequence[str] = (),
     levels: Sequence[str] = (),
@@ -95,7 +95,7 @@ def skin_task(work: Generalisation, model: ModelOnDisk, seed: int, trials: int) 
 def _touch(work: Generalisation, model: ModelOnDisk, seed: int, trials: int) -> UnseenScores:
     """Take some of the same trials on another skin, score them, and delete them."""
     item, folder = work.campaigns[0], work.folder / f"skin{seed}"
-    taken = Store.create(folder / "store").campaign(item.name).committed()
+    taken = TrialStore.create(folder / "store").campaign(item.name).committed()
     change = {"mock": {"scene": {"skin": {"seed": seed}}}}
     request = other_request(item, change, folder, most=max(0, trials - len(taken)))
     samples, _ = all_samples(*retake([request]))

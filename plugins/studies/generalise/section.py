@@ -19,7 +19,7 @@ RESULT = CommandResult("derived/generalisation/results.json", "sliplab generalis
 
 
 @dataclass(frozen=True)
-class SkinSection(Content):
+class GeneralisationSection(Content):
     """The network on skins and levels that it never saw, or how to measure it."""
 
     template: ClassVar[Path] = Path(__file__).with_name("section.html")
@@ -36,7 +36,7 @@ class SkinSection(Content):
 
 def skin_section(
     found: Json | None, command: str, strict: float | None, seeds: str = "", *, simulated: bool
-) -> SkinSection:
+) -> GeneralisationSection:
     """Show the results of `sliplab generalise`.
 
     Args:
@@ -46,7 +46,7 @@ def skin_section(
         StoreError: they are of another shape.
     """
     if found is None:
-        return SkinSection(command)
+        return GeneralisationSection(command)
     results = RESULT.parse(GeneralisationResults, found)
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     rows = []
@@ -59,7 +59,7 @@ def skin_section(
             [name, str(row.trials), str(row.n), percent(row.share), span, percent(row.seen)]
         )
     figure = unseen_figure(results, strict, simulated=simulated)
-    return SkinSection(command, figure, Table(columns, rows), seeds)
+    return GeneralisationSection(command, figure, Table(columns, rows), seeds)
 
 
 def unseen_figure(
@@ -84,7 +84,7 @@ def unseen_figure(
     return Figure(svg, name="skins", data=share_data(drawn))
 
 
-def _make(data: ReportData) -> SkinSection | None:
+def _make(data: ReportData) -> GeneralisationSection | None:
     if data.collected is None:
         return None
     kinematic = data.collected.kinematic

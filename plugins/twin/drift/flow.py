@@ -33,11 +33,11 @@ from sliplab.plugins.twin.worlds import (
     other_rig,
     simulated,
 )
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.shown import plural
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 MADE = frozenset(
     {
@@ -93,7 +93,7 @@ class OneSpecimen(Prior):
 class ReferenceTrials:
     """Labelled reference trials of a campaign in the plan's order, and what they recorded."""
 
-    trials: tuple[Trial, ...]
+    trials: tuple[PlannedTrial, ...]
     slides: Mapping[str, PilotTrial]
     checksum: str
 
@@ -103,7 +103,7 @@ class ReferenceTrials:
         return all(slide.forces is not None for slide in self.slides.values())
 
 
-def read_references(store: Store, item: Collected) -> ReferenceTrials:
+def read_references(store: TrialStore, item: Collected) -> ReferenceTrials:
     """Read the labelled reference trials of a campaign.
 
     Raises:
@@ -134,7 +134,7 @@ def read_references(store: Store, item: Collected) -> ReferenceTrials:
 
 
 def fit_drift(
-    store: Store,
+    store: TrialStore,
     item: Collected,
     references: ReferenceTrials,
     rig: RigFile,
@@ -161,7 +161,7 @@ def fit_drift(
 
 
 def calibrate_drift(
-    store: Store,
+    store: TrialStore,
     item: Collected,
     rig: RigFile,
     *,
@@ -205,7 +205,7 @@ def calibrate_drift(
 
 
 def parameter_drift(
-    it: SceneParameter, found: Drift, trials: Sequence[Trial], together: int
+    it: SceneParameter, found: Drift, trials: Sequence[PlannedTrial], together: int
 ) -> ParameterDrift:
     """Return the stored result of a parameter's drift.
 

@@ -33,7 +33,7 @@ from sliplab.protocols.detection import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import read_rig, rig_path, rig_yaml
 from sliplab.storage.files import make_folder, write_text
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 TRAINING = ("train", "validation")
 
@@ -48,7 +48,7 @@ class Gap:
         plan: of the trials that train. out: folder of all that is made. drawn: number of rigs.
     """
 
-    store: Store
+    store: TrialStore
     tested: list[Collected]
     rig: Path
     fitted: Path
@@ -71,7 +71,7 @@ class Trained:
 
 
 def request(
-    store: Store, tested: list[Collected], rig: Path, protocol: Path, out: Path, drawn: int
+    store: TrialStore, tested: list[Collected], rig: Path, protocol: Path, out: Path, drawn: int
 ) -> Gap:
     """Check a request before anything is simulated.
 

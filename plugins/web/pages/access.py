@@ -111,7 +111,7 @@ def set_cookie(name: str, value: str, *, secure: bool) -> tuple[str, str]:
     return "set-cookie", f"{name}={quote(value)}; {kept}"
 
 
-class Gate:
+class AccessGate:
     """An ASGI application that lets only known viewers reach `app`, and only operators change it.
 
     Without a cookie it answers 401 with the page `entry`; a reader's change, a change without the

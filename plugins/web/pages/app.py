@@ -14,7 +14,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from sliplab.plugins.web.pages import live, log, report, review, schedules, trials
-from sliplab.plugins.web.pages.access import Gate, cookie_name, set_cookie
+from sliplab.plugins.web.pages.access import AccessGate, cookie_name, set_cookie
 from sliplab.plugins.web.pages.web import PAGES, is_secure
 
 if TYPE_CHECKING:
@@ -32,7 +32,9 @@ def application(web: Web) -> Starlette:
     for subject in SUBJECTS:
         routes += subject(web)
     entry = web.templates.get_template("enter.html").render()
-    return Starlette(routes=routes, middleware=[Middleware(Gate, access=web.access, entry=entry)])
+    return Starlette(
+        routes=routes, middleware=[Middleware(AccessGate, access=web.access, entry=entry)]
+    )
 
 
 def _enter(web: Web) -> Callable[[Request], Awaitable[Response]]:

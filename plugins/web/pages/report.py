@@ -18,7 +18,7 @@ from starlette.routing import BaseRoute, Route
 
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import inside
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.plugins.web.pages.web import Web
@@ -51,7 +51,7 @@ _HEAD_BYTES = 20_000
 
 
 @dataclass(frozen=True)
-class Made:
+class ReportPage:
     """A page or the results of a step.
 
     Attributes:
@@ -92,12 +92,12 @@ def routes(web: Web) -> list[BaseRoute]:
     return [Route("/report", show), Route("/report/{path:path}", file)]
 
 
-def _made(store: Store) -> tuple[list[Made], list[Made]]:
+def _made(store: TrialStore) -> tuple[list[ReportPage], list[ReportPage]]:
     """Return the pages, that of the whole store first, and the steps up to it."""
     folder = store.folder / FOLDER
     paths = sorted(folder.rglob("*.html"), key=lambda path: (path != folder / MAIN, path))
-    pages = [Made(str(path.relative_to(folder)), _title(path), _when(path)) for path in paths]
-    steps = [Made(name, "", _when(store.folder / place)) for name, place in _STEPS]
+    pages = [ReportPage(str(path.relative_to(folder)), _title(path), _when(path)) for path in paths]
+    steps = [ReportPage(name, "", _when(store.folder / place)) for name, place in _STEPS]
     return pages, steps
 
 

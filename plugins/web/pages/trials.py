@@ -33,7 +33,7 @@ from sliplab.storage.trials import review
 from sliplab.storage.trials.catalogue import catalogue_so_far, query
 from sliplab.storage.trials.checksums import read_sums, to_fetch
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 if TYPE_CHECKING:
     from sliplab.plugins.web.pages.web import Web
@@ -148,7 +148,7 @@ class Choice:
         return table
 
 
-def _listing(store: Store, chosen: Choice) -> dict[str, Any]:
+def _listing(store: TrialStore, chosen: Choice) -> dict[str, Any]:
     """Return what the catalogue's page shows."""
     unreadable: list[str] = []
     table, left = catalogue_so_far(store, unreadable, READ_S)
@@ -216,7 +216,7 @@ def _names(request: Request) -> tuple[str, str]:
 class LoadedTrials:
     """Data of the trials that were looked at last; they are read again when they have changed."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: TrialStore) -> None:
         self.store = store
         self._lock = threading.Lock()
         self._found: OrderedDict[tuple[str, str], tuple[object, ShownTrial]] = OrderedDict()
@@ -278,7 +278,7 @@ class LoadedTrials:
         return frame_html(shown, shown.frame_at(float(asked.get("time", "nan"))))
 
 
-def row_of_shown(store: Store, shown: ShownTrial) -> ReviewRow | None:
+def row_of_shown(store: TrialStore, shown: ShownTrial) -> ReviewRow | None:
     """Return the state of a trial's label; None of a campaign without labels."""
     if not has_plan(shown.item.info):
         return None
@@ -324,7 +324,7 @@ def _about(loaded: LoadedTrials, campaign: str, trial: str, chosen: Choice) -> d
 
 
 def _neighbours(
-    store: Store, name: tuple[str, str], chosen: Choice
+    store: TrialStore, name: tuple[str, str], chosen: Choice
 ) -> tuple[tuple[str, str] | None, tuple[str, str] | None]:
     """Return the trials before and after one in a catalogue's choice."""
     table, _ = catalogue_so_far(store, [], READ_S)

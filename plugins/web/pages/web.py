@@ -15,7 +15,7 @@ from starlette.responses import HTMLResponse, Response
 from sliplab.plugins.web.pages.access import NAME_COOKIE, Access, Viewer, set_cookie
 from sliplab.plugins.web.review.trial_list import TrialList
 from sliplab.plugins.web.server.service import Service
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 PAGES = (
     ("/", "Live"),
@@ -53,7 +53,7 @@ class Web:
         templates: those of `templates/`.
     """
 
-    store: Store
+    store: TrialStore
     access: Access
     prefect: str | None = None
     schedules: Path | None = None

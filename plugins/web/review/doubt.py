@@ -22,14 +22,14 @@ from sliplab.analysis.labels.onsets import LabelOnsets as MarkerOnsets
 from sliplab.analysis.labels.onsets import last_off_axis
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.labels.slip_times import WIDEST_NS
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.protocols.shown import plural
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, RuleOnsets, TrialLabel
 from sliplab.storage.streams import F64, I64
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Decision, ReviewedOnsets, last
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 GRAVE, ODD, SLIGHT = 3, 2, 1
 """An onset in doubt; an onset that is not there; something to look at."""
@@ -50,7 +50,7 @@ class ReviewedTrial:
     """A trial with its present label and the last decision on it."""
 
     item: Collected
-    trial: Trial
+    trial: PlannedTrial
     recording: Recording
     label: TrialLabel
     decision: Decision | None
@@ -109,7 +109,7 @@ class LabelDoubt:
         return incipient, np.maximum(incipient, gross), chance >= self.unusable
 
 
-def labelled_trials(store: Store, item: Collected) -> list[ReviewedTrial]:
+def labelled_trials(store: TrialStore, item: Collected) -> list[ReviewedTrial]:
     """Return a campaign's trials whose label is of the trial and settings as they are now.
 
     Raises:
@@ -183,7 +183,7 @@ def unusable_shares(cases: Sequence[ReviewedTrial]) -> dict[int, float]:
 
 
 def doubts_of(
-    store: Store, cases: Sequence[ReviewedTrial], unusable: Mapping[int, float]
+    store: TrialStore, cases: Sequence[ReviewedTrial], unusable: Mapping[int, float]
 ) -> list[LabelDoubt]:
     """Return the doubt of each label of one campaign.
 
@@ -228,7 +228,9 @@ def _frame_ms(case: ReviewedTrial) -> float:
     return SLICE_NS / 1e6 if case.label.source == "events" else 0.0
 
 
-def _spreads_ms(store: Store, case: ReviewedTrial, onsets: ReviewedOnsets) -> dict[Kind, float]:
+def _spreads_ms(
+    store: TrialStore, case: ReviewedTrial, onsets: ReviewedOnsets
+) -> dict[Kind, float]:
     """Standard deviation of either onset by its own interval, or in doubt since the motion."""
     label, found = case.label, dict[Kind, float]()
     intervals = _stated(case) or _crossed(store, case)
@@ -255,7 +257,7 @@ def _stated(case: ReviewedTrial) -> dict[Kind, tuple[int, int] | None]:
     return {}
 
 
-def _crossed(store: Store, case: ReviewedTrial) -> dict[Kind, tuple[int, int] | None]:
+def _crossed(store: TrialStore, case: ReviewedTrial) -> dict[Kind, tuple[int, int] | None]:
     """Return when markers in frames, give or take two deviations, cross the paper's threshold."""
     label, settings = case.label, case.item.settings.labelling
     if label.rule != "paper" or label.paper is None or label.doubts.incipient:

@@ -35,7 +35,7 @@ from sliplab.protocols.shown import plural
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.evaluation import Evaluation
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 TRAINING = "training windows"
 """Windows that train or choose the network."""
@@ -137,7 +137,7 @@ class ReviewOrder:
         return sorted(gains, key=lambda gain: -gain.label_width / gain.width)
 
 
-def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
+def review_order(store: TrialStore, campaigns: Sequence[Collected]) -> ReviewOrder:
     """Order the labelled trials of some campaigns that have no decision yet.
 
     Raises:
@@ -196,7 +196,7 @@ def review_order(store: Store, campaigns: Sequence[Collected]) -> ReviewOrder:
 
 
 def _evaluation(
-    store: Store, waiting: Sequence[ReviewedTrial]
+    store: TrialStore, waiting: Sequence[ReviewedTrial]
 ) -> tuple[Evaluation | None, list[str]]:
     """Return the evaluation, if it is of the labels as they are, and else why there is none."""
     try:
@@ -218,7 +218,7 @@ def _evaluation(
 
 
 def _windows(
-    store: Store,
+    store: TrialStore,
     campaigns: Sequence[Collected],
     evaluation: Evaluation,
     drawn: dict[Name, ReviewDraws],
@@ -239,7 +239,7 @@ def _windows(
     return [accuracy_figure(evaluation, test, retained["counts"], length_ns, drawn)], shares
 
 
-def _samples(store: Store, split: str) -> SampleSet | None:
+def _samples(store: TrialStore, split: str) -> SampleSet | None:
     """Return the windows of a part of the split as they were last used; None if none are stored."""
     try:
         return SampleSet.load(Derived.of(store, SAMPLES).folder / f"{split}.arrays")

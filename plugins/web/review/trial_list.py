@@ -23,7 +23,7 @@ from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import Decision, ReviewedOnsets, Verdict
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 LabelState = Literal["fresh", "stale", "missing"]
 
@@ -76,7 +76,7 @@ class ReviewRow:
         return self.severity > 0
 
 
-def row_of(store: Store, item: Collected, trial: str, order: int) -> ReviewRow:
+def row_of(store: TrialStore, item: Collected, trial: str, order: int) -> ReviewRow:
     """Return the row of one committed trial.
 
     Raises:
@@ -120,7 +120,7 @@ class TrialList:
         changes: a number that grows whenever a row changes.
     """
 
-    def __init__(self, store: Store, campaigns: Sequence[str] = ()) -> None:
+    def __init__(self, store: TrialStore, campaigns: Sequence[str] = ()) -> None:
         self.store = store
         self._names = list(campaigns)
         self._folders: object = None

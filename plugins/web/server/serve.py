@@ -24,7 +24,7 @@ from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.plugins.web.server.service import Service, deployment_name
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 LOCK = ".serve.lock"
 PORT = 4200
@@ -36,7 +36,7 @@ POLL_S = 1.0
 
 
 def serve(
-    store: Store,
+    store: TrialStore,
     rig: str,
     name: str,
     schedules: Sequence[Scheduled],

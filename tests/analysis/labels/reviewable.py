@@ -22,7 +22,7 @@ from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import ReviewedOnsets, Verdict
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.conftest import ROOT
 
 NAME = "kinematic"
@@ -129,7 +129,7 @@ class Reviewable:
     """The campaign in its store."""
 
     def __init__(self, folder: Path, trials: int | None = None) -> None:
-        self.store = Store.create(folder)
+        self.store = TrialStore.create(folder)
         campaign = self.store.campaign(NAME)
         protocol = (ROOT / "protocols" / "kinematic.yaml").read_text()
         campaign.update({"name": NAME, "simulated": True}, protocol, "rig: 1\n")
@@ -146,7 +146,7 @@ class Reviewable:
         made.__dict__.pop("item", None)
         made.keys = dict(self.keys)
         shutil.copytree(self.store.folder, folder, copy_function=os.link)
-        made.store = Store.open(folder)
+        made.store = TrialStore.open(folder)
         return made
 
     @cached_property

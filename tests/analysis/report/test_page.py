@@ -23,7 +23,7 @@ from sliplab.analysis.report.figures.intervals import (
 from sliplab.analysis.report.outcomes import FailureSection
 from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
 from sliplab.analysis.report.trial import TrialSection
-from sliplab.plugins.studies.generalise.section import SkinSection
+from sliplab.plugins.studies.generalise.section import GeneralisationSection
 from sliplab.plugins.studies.plot import AxisPair as Pair
 from sliplab.plugins.studies.plot import DetectorPoint, cost_and_error
 
@@ -128,7 +128,7 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     sections = (
         TrialSection(EVIL, {EVIL: 1.0}, EVIL, True, figure),
         FailureSection(1, 2, [(EVIL, 1)], 1, commands, EVIL),
-        SkinSection(EVIL),
+        GeneralisationSection(EVIL),
     )
     page = render(*sections, simulated=True, notices=[EVIL])
     assert "<img" not in page
@@ -151,7 +151,7 @@ def test_first_screen_names_failures_and_unmeasured_results_once() -> None:
     fine = FailureSection(0, 2, [], 1, none, "s")
     assert "<li>Nothing.</li>" in render(fine)
     failed = FailureSection(1, 2, [("gross late", 1)], 1, none, "s")
-    page = render(SkinSection("sliplab generalise s"), failed)
+    page = render(GeneralisationSection("sliplab generalise s"), failed)
     assert '<li><a href="#s2">1 of 2 evaluated trials failed: 1 gross late</a></li>' in page
     assert page.count("Other skins, and levels left out") == 2  # its name and its command
     first, rest = page.split('<a id="unmeasured"></a>')
@@ -163,7 +163,7 @@ def test_first_screen_names_failures_and_unmeasured_results_once() -> None:
 
 def in_a_page(table: Table) -> str:
     """A page that shows a table."""
-    return render(SkinSection("", None, table))
+    return render(GeneralisationSection("", None, table))
 
 
 def test_words_read_from_the_left_and_commands_as_code() -> None:

@@ -14,7 +14,7 @@ from sliplab.analysis.report.plugin_sections import (
     plugin_sections,
     sections_key,
 )
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.protocols.test_plugin import installed
 
 __all__ = ["installed"]  # a fixture
@@ -54,7 +54,7 @@ def install(installed: Any, folder: Path, name: str, *changes: tuple[str, str]) 
 
 def test_a_section_of_another_package_is_shown(installed: Any, tmp_path: Path) -> None:
     install(installed, tmp_path, "lab_rubs")
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     (section,) = plugin_sections(ReportData(store, [], True))
     assert isinstance(section, Rendered)
     assert (section.title, [figure.name for figure in section.figures]) == ("Rubs", ["rubs-force"])
@@ -68,12 +68,12 @@ def test_a_section_of_another_package_is_shown(installed: Any, tmp_path: Path) -
 def test_a_key_stands_for_the_section(installed: Any, tmp_path: Path) -> None:
     keyed = ("ReportSection(make)", "ReportSection(make, lambda store, campaigns: [1, 'a'])")
     install(installed, tmp_path, "lab_keyed", keyed)
-    assert sections_key(Store.create(tmp_path / "store"), []) == [1, "a"]
+    assert sections_key(TrialStore.create(tmp_path / "store"), []) == [1, "a"]
 
 
 def test_nothing_is_shown_where_there_is_nothing(installed: Any, tmp_path: Path) -> None:
     install(installed, tmp_path, "lab_still", ("return Rubs()", "return None"))
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     assert list(plugin_sections(ReportData(store, [], False))) == []
     assert sections_key(store, []) == []
 
@@ -100,7 +100,7 @@ def test_one_that_fails_is_a_line(
 ) -> None:
     install(installed, tmp_path, "lab_broken", (before, after))
     install(installed, tmp_path, "lab_other", ('"rubs"', '"more"'), ("rubs-", "more-"))
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     *shown, last = plugin_sections(ReportData(store, [], True))
     assert [section.title for section in shown if isinstance(section, Rendered)] == ["Rubs"]
     assert isinstance(last, LostSections)
@@ -115,6 +115,6 @@ def test_a_key_that_fails_is_part_of_the_key(installed: Any, tmp_path: Path) -> 
     for name, key in (("lab_raises", "1 / 0"), ("lab_object", "[object()]")):
         keyed = ("ReportSection(make)", f"ReportSection(make, lambda *_: {key})")
         install(installed, tmp_path, name, ('"rubs"', f'"{name}"'), keyed)
-    first, second = sections_key(Store.create(tmp_path / "store"), [])
+    first, second = sections_key(TrialStore.create(tmp_path / "store"), [])
     assert first.startswith("lab_object: TypeError: ")
     assert second == "lab_raises: ZeroDivisionError: division by zero"

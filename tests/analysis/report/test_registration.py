@@ -14,11 +14,11 @@ from sliplab.analysis.report.registration import registration_key, registration_
 from sliplab.flows.register import register
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.trials.registration import registration_files
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.older import older_store
 
 
-def deviations(store: Store) -> dict[str, tuple[str, str]]:
+def deviations(store: TrialStore) -> dict[str, tuple[str, str]]:
     """Registered and found by name, but for versions: the store is an older one's."""
     section = registration_section(store, collected(store))
     (campaign,) = section.campaigns
@@ -33,18 +33,18 @@ def deviations(store: Store) -> dict[str, tuple[str, str]]:
 @pytest.fixture(scope="module")
 def registered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with an evaluation, registered as it is."""
-    found = Store.open(older_store(tmp_path_factory.mktemp("registered") / "store"))
+    found = TrialStore.open(older_store(tmp_path_factory.mktemp("registered") / "store"))
     register(found.campaign("small").protocol_file, found.folder, campaign="small")
     return found.folder
 
 
 @pytest.fixture
-def store(registered: Path, tmp_path: Path) -> Store:
+def store(registered: Path, tmp_path: Path) -> TrialStore:
     """A copy of it, to be changed at will."""
-    return Store.open(shutil.copytree(registered, tmp_path / "store"))
+    return TrialStore.open(shutil.copytree(registered, tmp_path / "store"))
 
 
-def evaluated(store: Store, **changes: Any) -> None:
+def evaluated(store: TrialStore, **changes: Any) -> None:
     """Change the evaluation as options do."""
     path = store.folder / "derived" / "evaluation" / "evaluation.json"
     data = read_json(path)
@@ -53,7 +53,7 @@ def evaluated(store: Store, **changes: Any) -> None:
     write_json(path, data | changes)
 
 
-def test_evaluation_by_the_protocol_is_no_deviation(store: Store) -> None:
+def test_evaluation_by_the_protocol_is_no_deviation(store: TrialStore) -> None:
     assert [*deviations(store)] == ["trials taken before the registration"]
 
 
@@ -62,7 +62,7 @@ def test_evaluation_by_the_protocol_is_no_deviation(store: Store) -> None:
     [({"margin": 5.0}, "smoothing 4, margin 5"), ({"smoothing": 2}, "smoothing 2, margin 8")],
 )
 def test_given_margin_or_smoothing_is_a_deviation(
-    store: Store, detection: dict[str, Any], found: str
+    store: TrialStore, detection: dict[str, Any], found: str
 ) -> None:
     before = registration_key(store, collected(store))
     evaluated(store, detection=detection)
@@ -71,18 +71,18 @@ def test_given_margin_or_smoothing_is_a_deviation(
     assert registration_key(store, collected(store)) != before
 
 
-def test_choice_by_the_protocol_is_no_deviation(store: Store) -> None:
+def test_choice_by_the_protocol_is_no_deviation(store: TrialStore) -> None:
     evaluated(store, detection={"margin": 5.0, "choose": "validation"})
     assert "evaluate --smoothing, --margin" not in deviations(store)
 
 
-def test_review_decisions_are_a_deviation(store: Store) -> None:
+def test_review_decisions_are_a_deviation(store: TrialStore) -> None:
     evaluated(store, reviewed={"accepted": 3, "corrected": 1})
     listed = deviations(store)["evaluate --reviewed"]
     assert listed[1] == "review decisions are applied: 3 accepted, 1 corrected"
 
 
-def test_section_escapes_what_it_shows(store: Store) -> None:
+def test_section_escapes_what_it_shows(store: TrialStore) -> None:
     campaign = store.campaign("small")
     text = campaign.protocol_file.read_text()
     campaign.update(campaign.info, f"{text}# <script>\n", "")
@@ -96,7 +96,7 @@ def test_section_escapes_what_it_shows(store: Store) -> None:
 
 
 @pytest.mark.parametrize("deleted", [False, True])
-def test_changed_or_missing_registration_proves_nothing(store: Store, deleted: bool) -> None:
+def test_changed_or_missing_registration_proves_nothing(store: TrialStore, deleted: bool) -> None:
     campaign = store.campaign("small")
     (path,) = registration_files(campaign)
     session = campaign.folder / "bench" / "0001.json"

@@ -12,7 +12,7 @@ from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import label
 from sliplab.protocols import InputError
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.analysis.foreign import chunk, foreign_campaign
 
 MS = 1_000_000
@@ -44,7 +44,7 @@ def item(tmp_path: Path) -> Collected:
 
 
 def test_windows_lie_in_their_part_and_are_drawn_where_there_are_more(item: Collected) -> None:
-    store = Store.open(item.campaign.folder.parents[1])
+    store = TrialStore.open(item.campaign.folder.parents[1])
     campaigns = collected(store)
     assert of_classes(campaigns)
     assert class_names(campaigns) == ("9", "10")

@@ -26,7 +26,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.flows.cli.study_command import study_app
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.conftest import shape_of
 
 pytestmark = pytest.mark.long
@@ -36,22 +36,22 @@ GUESS = "event_camera.contrast"
 
 
 @pytest.fixture(scope="module")
-def store(own_study: Store) -> Store:
+def store(own_study: TrialStore) -> TrialStore:
     """A copy of the small study, its contrast measured down and up."""
     measure_guesses(own_study, collected(own_study), (GUESS,), 20)
     return own_study
 
 
-def kept(store: Store) -> dict[str, Json]:
+def kept(store: TrialStore) -> dict[str, Json]:
     found: dict[str, Json] = read_json(store.folder / "derived/guesses/results.json")["settings"]
     return found
 
 
-def scores(store: Store) -> dict[str, SettingScores]:
+def scores(store: TrialStore) -> dict[str, SettingScores]:
     return SensitivityResults.load(store.folder / "derived/guesses/results.json").settings
 
 
-def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: Store) -> None:
+def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: TrialStore) -> None:
     ours = Derived.of(store, "evaluation").read("evaluation")["trials"]
     again = [
         {key: value for key, value in row.items() if key != "depth_zero_mm"}
@@ -61,7 +61,7 @@ def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: Store) -> None:
     assert sorted(again, key=lambda row: row["trial"]) == sorted(ours, key=lambda row: row["trial"])
 
 
-def test_a_change_is_seen_and_compared_trial_by_trial(store: Store) -> None:
+def test_a_change_is_seen_and_compared_trial_by_trial(store: TrialStore) -> None:
     settings = kept(store)
     assert list(settings) == [AS_IT_IS, f"{GUESS} x 0.8", f"{GUESS} x 1.2"]
     base, lower, higher = settings.values()
@@ -109,7 +109,7 @@ TRIAL = {
 }
 
 
-def test_a_setting_has_these_keys(store: Store) -> None:
+def test_a_setting_has_these_keys(store: TrialStore) -> None:
     path = store.folder / "derived/guesses/results.json"
     assert json_text(SensitivityResults.load(path).to_json()) == path.read_text()
     file = read_json(path)
@@ -142,7 +142,7 @@ def test_a_setting_has_these_keys(store: Store) -> None:
     assert all(len(pair) == 2 for pair in lower["windows"].values())
 
 
-def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: Store) -> None:
+def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: TrialStore) -> None:
     again = measure_guesses(store, collected(store), (GUESS,), 20)
     assert again.measured == 0
     folder = store.folder / "derived" / "guesses"
@@ -150,10 +150,10 @@ def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: Store) ->
 
 
 def test_stopped_between_two_settings_it_goes_on(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
-    other = Store.open(tmp_path / "store")
+    other = TrialStore.open(tmp_path / "store")
     file = other.folder / "derived/guesses/results.json"
     write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
 
@@ -172,7 +172,7 @@ def test_stopped_between_two_settings_it_goes_on(
 
 
 def test_another_network_is_another_measurement(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = StudySensitivity(store, collected(store), TRIALS)
     assert guess_sweep(work, (GUESS,)).pending == []
@@ -180,7 +180,7 @@ def test_another_network_is_another_measurement(
     assert len(guess_sweep(work, (GUESS,)).pending) == 3
 
 
-def test_a_command_shows_them(store: Store) -> None:
+def test_a_command_shows_them(store: TrialStore) -> None:
     done = CliRunner().invoke(study_app(STUDY), [str(store.folder), "--guess", GUESS, "--json"])
     assert done.exit_code == 0, done.output
     reported = json.loads(done.stdout)

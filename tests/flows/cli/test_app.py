@@ -13,7 +13,7 @@ import pytest
 
 from sliplab.flows.cli import errors
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import SECRET, SLIPLAB, here, sliplab, wait_for
 from tests.conftest import ROOT
@@ -162,7 +162,7 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
     counts = [result[name] for name in ("committed", "taken", "missing")]
     assert counts == [6, 6 - len(early), 0]
     assert all((trials / name).stat().st_mtime_ns == t for name, t in early.items())
-    assert verify(Store.open(store)) == []
+    assert verify(TrialStore.open(store)) == []
     for name, expected in undisturbed.items():
         assert read_json(trials / name / "checksums.json") == expected
     for kept in store.rglob("*"):

@@ -16,7 +16,7 @@ from sliplab.flows.collecting import requests
 from sliplab.storage.process import this_process
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import SLIPLAB, answer, here, wait_for
 from tests.conftest import ROOT
@@ -70,7 +70,7 @@ def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
         assert stopped["did"] == {"stopped": True, "running": True}
         assert process.wait(timeout=60) == 130, log.read_text()
     assert "every committed trial is kept" in log.read_text()
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     assert [item.kind for item in control.requests(opened)] == ["pause", "again", "resume", "stop"]
     assert control.open_requests(opened) == []
     assert len(list(trials.iterdir())) < 180
@@ -113,7 +113,7 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     whole = answer(*collect)
     assert (whole["committed"], whole["taken"], whole["quarantined"]) == (3, 2, 1)
     assert answer("trials", store)["set_aside"] == []
-    assert verify(Store.open(store)) == []
+    assert verify(TrialStore.open(store)) == []
 
 
 def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
         process.kill()
         process.wait(timeout=60)
     first = min(path.name for path in trials.iterdir())
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     control.ask(opened, "again", campaign="tiny", trials=(first,), why="dust")  # and killed, too
     collect = ("collect", protocol, "--rig", RIG, "--store", store, "--trials", 1)
     assert here(*collect).returncode == 1
@@ -151,7 +151,7 @@ with exclusive(Path(sys.argv[1]), "the store"):
 @pytest.mark.parametrize("script", [SLEEPER, HOLDER])
 def test_stop_signals_nothing_but_a_collection(script: str, tmp_path: Path) -> None:
     """Neither whom a stale lock names, nor who holds the lock for something else."""
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     process = subprocess.Popen(
         [sys.executable, "-c", script, store.folder / ".lock"],
         cwd=ROOT,
@@ -176,7 +176,7 @@ def test_stop_signals_nothing_but_a_collection(script: str, tmp_path: Path) -> N
 
 
 def test_waiting_for_a_trial_to_end_is_bounded_and_the_request_stands(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     begin = time.monotonic()
     with exclusive(store.folder / ".lock", "the store", about={"collects": "tiny"}):
         outcome = requests.ask(store, "pause", limit_s=1.0)

@@ -14,7 +14,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.command_line import here, outcome
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -48,7 +48,7 @@ def test_in_and_out(tmp_path: Path) -> None:
     assert (code, reported["events"]) == (0, 50)
     code, reported, _ = outcome("import", "aedat4", out, "--store", store, "--name", "b", "--json")
     assert (code, reported["imported"]) == (0, ["slide"])
-    assert not Store.open(store).simulated
+    assert not TrialStore.open(store).simulated
     code, _, said = outcome("export", store, "a", "--as", "labels", "--output", tmp_path / "l.csv")
     assert code == 1
     assert "a has no labels" in said
@@ -218,10 +218,10 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="is an imported campaign"):
         make_request(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
     with pytest.raises(StoreError, match="imported without an adapter"):
-        collected(Store.open(store))
-    where = Store.open(store).campaign("c")
+        collected(TrialStore.open(store))
+    where = TrialStore.open(store).campaign("c")
     where.update({"name": "c", "simulated": True}, "protocol: 1\n", "rig: 1\n")
     commit(where, "t")
-    assert [item.name for item in collected(Store.open(store))] == ["c"]
+    assert [item.name for item in collected(TrialStore.open(store))] == ["c"]
     with pytest.raises(InputError, match="without an adapter"):
-        collected(Store.open(store), ["tiny"])
+        collected(TrialStore.open(store), ["tiny"])

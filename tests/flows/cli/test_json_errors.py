@@ -18,7 +18,7 @@ from sliplab.flows.running.cluster import ClusterError
 from sliplab.rigs.core.capabilities import ArmFault
 from sliplab.rigs.core.guard import DepthError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.analysis.labels.reviewable import Reviewable
 from tests.command_line import SECRET, here
 from tests.conftest import ROOT
@@ -247,7 +247,7 @@ def test_interrupted_command_names_trials_only_where_it_resumes_them(
 
 
 def test_a_missing_file_of_a_store_is_named(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     (store.folder / "store.json").write_text("{")
     error = error_of("trials", store.folder)
     assert (error["exit_code"], error["file"]) == (1, str(store.folder / "store.json"))

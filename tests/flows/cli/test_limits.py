@@ -17,7 +17,7 @@ import pytest
 
 from sliplab.flows.running.process import exhausted, too_few_threads
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
@@ -119,15 +119,15 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def store(taken: Path, tmp_path: Path) -> Store:
+def store(taken: Path, tmp_path: Path) -> TrialStore:
     """A store with one committed trial."""
-    return Store.open(shutil.copytree(taken, tmp_path / "s"))
+    return TrialStore.open(shutil.copytree(taken, tmp_path / "s"))
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
 @pytest.mark.parametrize("function", ["read_json", "sha256"])
 def test_a_trial_that_cannot_be_read_now_is_not_damaged(
-    number: int, function: str, store: Store, monkeypatch: pytest.MonkeyPatch
+    number: int, function: str, store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sweeping and quarantine would move a whole trial away."""
     (campaign,) = store.campaigns()

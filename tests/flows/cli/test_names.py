@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.storage.trials.store import NoStore, Store
+from sliplab.storage.trials.store import NoStore, TrialStore
 from tests.command_line import here
 
 LONG = "k" * 300
@@ -62,5 +62,5 @@ def test_a_url_is_no_folder_of_a_store(
 def test_a_store_is_not_created_at_a_url(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(NoStore, match=URL):
-        Store.create(Path("s3://bucket/store"))
+        TrialStore.create(Path("s3://bucket/store"))
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 from sliplab.flows.cli.store import FOLLOW_S
 from sliplab.flows.running import stopping
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import outcome
 from tests.storage.remote.remotes import tree
@@ -51,7 +51,7 @@ def test_there_and_back(made: Path, tmp_path: Path) -> None:
     code, back, _ = sliplab("pull", url, tmp_path / "back")
     assert (code, back["pulled"], back["files"]) == (0, 2, 14)
     assert tree(tmp_path / "back", "campaigns") == tree(made, "campaigns")
-    assert verify(Store.open(tmp_path / "back")) == []
+    assert verify(TrialStore.open(tmp_path / "back")) == []
     code, seen, _ = sliplab("verify", url)
     assert (code, seen["trials"], seen["whole"], seen["ok"]) == (0, 2, 2, True)
 
@@ -103,7 +103,7 @@ def test_follow_ends_with_the_collection(
 
     def meanwhile(seconds: float) -> None:
         waited.append(seconds)
-        commit(Store.open(store).campaign("c"), f"depth={len(waited)}mm")
+        commit(TrialStore.open(store).campaign("c"), f"depth={len(waited)}mm")
         if len(waited) == 2:
             holding.__exit__(None, None, None)
 

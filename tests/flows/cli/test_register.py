@@ -14,7 +14,7 @@ from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.registration import registration_key, registration_section
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.trials.registration import add_registration, registration_problems
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
@@ -32,7 +32,7 @@ def words(text: str) -> str:
 
 def section(store: Path) -> str:
     """The report's section, in one line."""
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     found = registration_section(opened, collected(opened))
     assert found is not None
     return words(str(render_section(found, simulated=True).html))
@@ -40,7 +40,7 @@ def section(store: Path) -> str:
 
 def key(store: Path) -> list[str]:
     """What the report's freshness depends on."""
-    opened = Store.open(store)
+    opened = TrialStore.open(store)
     return registration_key(opened, collected(opened))
 
 
@@ -179,7 +179,7 @@ def test_wrong_input_registers_nothing(tmp_path: Path) -> None:
 
 def test_export_and_publish_take_registrations_along(tmp_path: Path) -> None:
     store = older_store(tmp_path / "store")
-    path = add_registration(Store.open(store).campaign("small"), CONTENT)
+    path = add_registration(TrialStore.open(store).campaign("small"), CONTENT)
     path.with_name("0001.json.ots").write_bytes(bytes.fromhex(sha256(path)))
     answer("export", store, "small", "--output", tmp_path / "out")
     answer("export", store, "--as", "croissant", "--output", tmp_path / "data")
@@ -189,7 +189,7 @@ def test_export_and_publish_take_registrations_along(tmp_path: Path) -> None:
         assert (copy / "0001.json.ots").is_file()
     taken = answer("import", tmp_path / "out", "--store", tmp_path / "again", "--name", "small")
     assert "skipped" not in taken
-    published = Store.open(tmp_path / "data").campaign("small")
+    published = TrialStore.open(tmp_path / "data").campaign("small")
     assert list(registration_problems(published)) == []
     sums = (tmp_path / "data" / "checksums.sha256").read_text()
     assert "campaigns/small/registrations/0001.json.ots" in sums

@@ -12,7 +12,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.lock import Locked, exclusive
-from sliplab.storage.trials.store import FORMAT, Store, StoreError
+from sliplab.storage.trials.store import FORMAT, StoreError, TrialStore
 from tests.command_line import outcome
 from tests.flows.collecting.test_faults import TRACKS, slides
 from tests.flows.collecting.test_session import session
@@ -47,7 +47,7 @@ def flip(path: Path) -> None:
 def test_figures_add_up_after_damage(whole: Path) -> None:
     (trials(whole)[0] / "data.h5").write_bytes(b"x")
     run_request = requested(whole)
-    campaign = Store.open(whole / "store").campaign("tiny")
+    campaign = TrialStore.open(whole / "store").campaign("tiny")
     counts = run_request.counts(campaign)
     assert (counts["planned"], counts["committed"], counts["missing"]) == (2, 1, 1)
     assert [trial.id for trial in pending_trials(run_request.plan, campaign)] == [
@@ -103,7 +103,7 @@ def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(whole: Path
             assert Path(found["copies"][0], "store.json").is_file()
         else:
             with open_session(requested(whole)):
-                assert Store.open(whole / "store").format == FORMAT
+                assert TrialStore.open(whole / "store").format == FORMAT
     code, found, _ = outcome("migrate", whole / "store", "--json")
     assert (code, found["from"]) == (0, [])
 

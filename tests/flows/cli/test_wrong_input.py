@@ -13,7 +13,7 @@ import yaml
 
 from sliplab.flows.cli.app import command_line
 from sliplab.protocols.shown import MASK
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 
@@ -165,7 +165,7 @@ def test_schema_without_a_kind_lists_the_kinds() -> None:
 
 
 def test_requests_pass_their_options_on(tmp_path: Path) -> None:
-    folder = Store.create(tmp_path / "store").folder
+    folder = TrialStore.create(tmp_path / "store").folder
     for words in (("pause", folder, "--why", "lunch", "--wait", "1"), ("resume", folder)):
         done = here(*words, "--who", "anna", "--json")
         assert done.returncode == 0, done.stderr

@@ -18,7 +18,7 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 
@@ -56,7 +56,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def only(folder: Path) -> Recording:
     """The trial in a folder's store."""
-    campaign = Store.open(folder / "store").campaign("pilot")
+    campaign = TrialStore.open(folder / "store").campaign("pilot")
     return campaign.recording(*campaign.committed())
 
 
@@ -78,7 +78,7 @@ def test_one_camera_is_enough_to_collect(camera: str, taken: dict[str, Path]) ->
     assert ("frames_lost" in gates) == (camera == "frames")
     # its clock is right: the arm's poses say when the slide began, and the truth agrees
     assert found.step("slide")[1] > found.step("slide")[0]
-    store = Store.open(taken[camera] / "store")
+    store = TrialStore.open(taken[camera] / "store")
     assert verify(store) == []
     with pytest.raises(StoreError, match="has no label yet"):
         train(store, collected(store))

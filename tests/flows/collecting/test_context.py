@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.analysis.campaigns import collected as campaigns_of
 from sliplab.analysis.report.outcomes import Conditions
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import session
@@ -67,7 +67,7 @@ def test_skins_and_temperatures_go_through_every_step(tmp_path: Path) -> None:
         assert sorted(set(table["temperature_degC"])) == [21.0, 35.5]
 
     assert answer("label", store)["done"] == 8
-    campaigns = campaigns_of(Store.open(store))
+    campaigns = campaigns_of(TrialStore.open(store))
     parts = {trial.id: trial.split for trial, _ in campaigns[0].trials}
     for name, part in parts.items():
         held = "validation" if "temperature=35.5degC" in name else "train"

@@ -20,7 +20,7 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.faults import KINDS
 from sliplab.rigs.core.rig import Rig
 from sliplab.storage.errors import StoreError
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import checksums, session, short
@@ -175,7 +175,7 @@ def test_faults_once_each_in_a_campaign_as_in_the_table(tmp_path: Path, every: i
     sound.take(pending_trials(sound.plan, campaign))
     assert len(sound.plan) == len(campaign.committed()) == planned
     assert kept.items() <= checksums(campaign).items()
-    assert verify(Store.open(tmp_path / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "store")) == []
     counts = requested(tmp_path).counts(campaign)
     assert (counts["planned"], counts["missing"], counts["set_aside"]) == (planned, 0, [])
 

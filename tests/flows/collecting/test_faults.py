@@ -17,7 +17,7 @@ from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.storage.errors import disk_full
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.trial import TrialRecord
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.flows.collecting.test_session import checksums, session, short
@@ -48,7 +48,7 @@ def goes_on(folder: Path, kept: dict[str, str], data: dict[str, Any] | None = No
     take_all(again)
     assert len(campaign.committed()) == len(again.plan)
     assert kept.items() <= checksums(campaign).items()
-    assert verify(Store.open(folder / "store")) == []
+    assert verify(TrialStore.open(folder / "store")) == []
 
 
 # -- faults that end a stretch of work -----------------------------------------------------
@@ -195,7 +195,7 @@ def test_a_gate_sees_it_and_the_trial_is_taken_again(
     (recording,) = campaign.recordings()
     assert recording.record.attempt == 1
     assert recording.record.quality.passed
-    assert verify(Store.open(tmp_path / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "store")) == []
 
 
 def test_the_deviation_that_a_gate_measures_is_the_arms(tmp_path: Path) -> None:

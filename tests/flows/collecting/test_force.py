@@ -34,7 +34,7 @@ from sliplab.storage.streams import Chunk, NullSink, WrenchChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_faults import slides
@@ -69,7 +69,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("force")
     work, campaign = felt(folder, gated(normal_force="5 N", hold_force="1 N"))
     take_all(work)
-    assert verify(Store.open(folder / "a" / "store")) == []
+    assert verify(TrialStore.open(folder / "a" / "store")) == []
     (recording,) = campaign.recordings()
     return recording
 
@@ -125,7 +125,7 @@ def test_figures_of_the_forces_are_in_record_and_catalogue(taken: Recording) -> 
     assert figures["normal_peak_n"] == pytest.approx(figures["normal_hold_n"], rel=0.15)
     assert 0.5 < figures["tangential_peak_n"] < figures["normal_peak_n"]
     assert 0.4 < figures["friction_peak"] < 1.0
-    table = catalogue(Store.open(taken.folder.parents[3]))
+    table = catalogue(TrialStore.open(taken.folder.parents[3]))
     row = table[table["trial"] == taken.trial_id].iloc[0]
     for name, value in figures.items():
         assert row[f"force_{name}"] == value
@@ -157,7 +157,7 @@ def test_references_of_a_skin_that_wears_stop_a_campaign(per_m: float, tmp_path:
     data["collection"]["gates"]["reference"] = {"event_rate": "90 %", "friction": "10 %"}
     work, campaign = felt(tmp_path, data, faults=[{"kind": "skin_wear", "per_m": per_m}])
     run_request = requested(tmp_path / "a")
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
     if per_m == 0.0:
         take_all(work)
@@ -200,7 +200,7 @@ def test_a_rig_without_a_sensor_says_nothing_of_forces(unfelt: Campaign) -> None
     assert not has_forces(recording)
     with pytest.raises(StoreError, match="no wrench 'force'"):
         plate_forces(recording)
-    store = Store.open(unfelt.folder.parents[1])
+    store = TrialStore.open(unfelt.folder.parents[1])
     assert force_section(store, [Collected(unfelt)], None, simulated=True) is None
     label, _ = label_results(recording, Labelling())
     assert "force" not in label.to_json()
@@ -235,7 +235,7 @@ def test_figures_are_of_the_right_stretches() -> None:
 
 
 def test_forces_are_seen_in_rerun(taken: Recording, tmp_path: Path) -> None:
-    store = Store.open(taken.folder.parents[3])
+    store = TrialStore.open(taken.folder.parents[3])
     path = tmp_path / "a.rrd"
     counts = view.save(view.find(store, taken.trial_id), path)
     forces = plate_forces(taken)
@@ -246,7 +246,7 @@ def test_forces_are_seen_in_rerun(taken: Recording, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Slides that are long enough to slip, labelled."""
     folder = tmp_path_factory.mktemp("labelled")
     data = tiny()
@@ -254,7 +254,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
     data["analysis"]["split"] = {"method": "ranked"}
     work, campaign = felt(folder, data)
     take_all(work)
-    store = Store.open(folder / "a" / "store")
+    store = TrialStore.open(folder / "a" / "store")
     settings = work.plan.protocol.analysis.labelling
     for recording in campaign.recordings():
         label, arrays = label_results(recording, settings)
@@ -264,7 +264,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return store
 
 
-def test_the_label_has_onsets_by_force(labelled: Store) -> None:
+def test_the_label_has_onsets_by_force(labelled: TrialStore) -> None:
     (item,) = [Collected(campaign) for campaign in labelled.campaigns()]
     for _, recording in item.trials:
         label = Derived.of(labelled, LABELS, item.name).load(recording.trial_id, TrialLabel)
@@ -275,7 +275,7 @@ def test_the_label_has_onsets_by_force(labelled: Store) -> None:
         assert force.incipient_ns < force.gross_ns < truth["gross_ns"]
 
 
-def test_the_force_may_rule(labelled: Store) -> None:
+def test_the_force_may_rule(labelled: TrialStore) -> None:
     (item,) = [Collected(campaign) for campaign in labelled.campaigns()]
     recording = item.trials[0][1]
     settings = item.settings.labelling.model_copy(update={"rule": "force"})
@@ -284,7 +284,7 @@ def test_the_force_may_rule(labelled: Store) -> None:
     assert set(label.per_marker_ns) == {-1}
 
 
-def test_the_report_shows_the_forces(labelled: Store) -> None:
+def test_the_report_shows_the_forces(labelled: TrialStore) -> None:
     items = [Collected(campaign) for campaign in labelled.campaigns()]
     section = force_section(labelled, items, None, simulated=True)
     assert section.trials == 2

@@ -15,8 +15,8 @@ from sliplab.analysis.clocks.refit import fit_again
 from sliplab.flows.api import open_store
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
-from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.preflight import check
+from sliplab.flows.planning.size_estimate import trial_bytes
 from sliplab.plugins.simulation.further_settings import Thermometer
 from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.plugins.simulation.thermometer import MockThermometer
@@ -30,7 +30,7 @@ from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import answer, here
 from tests.conftest import ROOT
@@ -103,7 +103,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("streams") / "a"
     work, campaign = session(folder, ALL)
     work.take(pending_trials(work.plan, campaign)[:1])
-    assert verify(Store.open(folder / "store")) == []
+    assert verify(TrialStore.open(folder / "store")) == []
     (recording,) = campaign.recordings()
     return recording
 
@@ -224,7 +224,7 @@ def test_gates_and_catalogue_know_them(taken: Recording) -> None:
     assert {f"frames_lost_{name}" for name in ("back", "free", "heard")} <= gates.keys()
     assert {"event_gap_side_s", "event_burst_side"} <= gates.keys()
     assert all(gate.passed for gate in gates.values())
-    row = catalogue(Store.open(taken.folder.parents[3])).iloc[0]
+    row = catalogue(TrialStore.open(taken.folder.parents[3])).iloc[0]
     assert row["side_events"] == taken.record.streams["side"].rows
     assert row["back_frames"] == taken.record.streams["back"].rows
     assert 22 < row["warm_mean"] < 24
@@ -279,7 +279,7 @@ def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
     take_all(again)
     assert checksums(pieces) == expected
     assert any(path.name.startswith(trial.id) for path in (pieces.folder / "quarantine").iterdir())
-    assert verify(Store.open(tmp_path / "b" / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "b" / "store")) == []
 
 
 def record_calls(rig: Rig, called: list[str]) -> None:
@@ -349,7 +349,7 @@ def test_a_camera_that_falls_silent_fails_a_gate(tmp_path: Path) -> None:
 
 
 def test_the_viewer_shows_them(taken: Recording, tmp_path: Path) -> None:
-    store = Store.open(taken.folder.parents[3])
+    store = TrialStore.open(taken.folder.parents[3])
     counts = view.save(view.find(store, taken.trial_id), tmp_path / "t.rrd")
     for shown in ("side_events", "back_frames", "wrist_wrench", "warm_scalar"):
         assert counts[shown] == taken.record.streams[shown.partition("_")[0]].rows
@@ -498,7 +498,7 @@ def test_a_rig_with_one_first_camera_has_further_ones(cameras: list[str], tmp_pa
     work, campaign = session(tmp_path / "a", {"side": SIDE, "back": BACK}, cameras=cameras)
     work.take(pending_trials(work.plan, campaign)[:1])
     (recording,) = campaign.recordings()
-    assert verify(Store.open(tmp_path / "a" / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "a" / "store")) == []
     assert recording.streams("events") == [*(["events"] if cameras == ["events"] else []), "side"]
     assert len(recording.events(stream="side")) > 100
     assert len(recording.frame_times("back")) > 50

@@ -13,7 +13,7 @@ from sliplab.plugins.abb_socket.settings import AbbSocketSettings
 from sliplab.plugins.devices.abb.settings import AbbSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.conftest import take_all
 from tests.flows.live import (
@@ -70,7 +70,7 @@ def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:
     assert gates["sync_uncertainty_frames_s"].grade == "hardware trigger"
     assert gates["sync_uncertainty_arm_s"].grade == "digital input"
     assert gates["frames_lost"].value == 0
-    assert verify(Store.open(taken.run_request.store)) == []
+    assert verify(TrialStore.open(taken.run_request.store)) == []
 
 
 def test_its_labels_are_those_of_the_mock(taken: Taken) -> None:

@@ -26,7 +26,7 @@ from sliplab.plugins.loopback.client import Loopback
 from sliplab.rigs.build import calibrated_arm
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import checksums
 from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
@@ -210,7 +210,7 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
     now = checksums(campaign)
     assert good.items() <= now.items()
     assert now.keys() - good.keys() == {failed["trial"]}
-    assert verify(Store.open(run_request.store)) == []
+    assert verify(TrialStore.open(run_request.store)) == []
 
 
 def nobody_unlocks_it(run_request: RunRequest, stage: Loopback) -> None:
@@ -245,7 +245,7 @@ def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
     # a busy machine may lose one more
     assert re.fullmatch(r"gate: frames_lost = [3-9] \(limit 0\)", failed["cause"])
     assert campaign.recording(failed["trial"]).record.attempt == 1
-    assert verify(Store.open(run_request.store)) == []
+    assert verify(TrialStore.open(run_request.store)) == []
 
 
 @pytest.mark.long

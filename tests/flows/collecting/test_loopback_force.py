@@ -14,7 +14,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.timing import Delay, ForceTiming
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.conftest import take_all
 from tests.flows.live import at_work, only_trial, quick, request_in, rig_yaml, stage_of
@@ -64,7 +64,7 @@ def test_forces_come_through_the_wire_as_the_mock_has_them(
         take_all(work)
         assert [failed["cause"] for failed in campaign.quarantined()] == []
         (live,) = campaign.recordings()
-    assert verify(Store.open(run_request.store)) == []
+    assert verify(TrialStore.open(run_request.store)) == []
     counts = (live.record.devices or {})["force_sensor"]["counts"]
     assert (counts["lost"], counts["late"], counts["malformed"]) == (0, 0, 0)
     agree(live, run_request, tmp_path)
@@ -130,7 +130,7 @@ def test_a_trial_has_the_arms_own_wrench_by_its_clock(
         take_all(work)
         assert [failed["cause"] for failed in campaign.quarantined()] == []
         (live,) = campaign.recordings()
-    assert verify(Store.open(by_the_arm.store)) == []
+    assert verify(TrialStore.open(by_the_arm.store)) == []
     clock = live.record.clocks.streams["force"]
     assert (clock.grade, clock.uncertainty_ns) == (
         "arm clock",

@@ -10,7 +10,7 @@ import pytest
 from sliplab.protocols import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import take_all, write
@@ -34,7 +34,7 @@ def test_two_event_cameras_are_recorded_on_one_time_line(tmp_path: Path) -> None
             take_all(work)
             (recording,) = campaign.recordings()
             sent = stage.sent()
-        assert verify(Store.open(run_request.store)) == []
+        assert verify(TrialStore.open(run_request.store)) == []
         record = recording.record
         side = record.streams["side"]
         assert (side.kind, side.size_px) == ("events", (320, 240))

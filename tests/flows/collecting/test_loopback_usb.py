@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.conftest import take_all
 from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
@@ -38,7 +38,7 @@ def test_frames_of_a_usb_camera_show_the_slide(tmp_path: Path) -> None:
     ):
         take_all(work)
         (recording,) = campaign.recordings()
-    assert verify(Store.open(run_request.store)) == []
+    assert verify(TrialStore.open(run_request.store)) == []
     record = recording.record
     assert record.simulated
     assert record.clocks.frames.grade == "host arrival"

@@ -14,7 +14,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import answer
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -39,7 +39,7 @@ def agrees(recording: Recording, store: Path) -> dict[str, Any]:
     return found
 
 
-def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> Store:
+def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> TrialStore:
     """The only trial of a protocol with another motion and other factors, labelled."""
     data = tiny()
     data["name"] = "moves"
@@ -55,7 +55,7 @@ def collected(folder: Path, motion: Any, rig: Path = RIG, **factors: Any) -> Sto
     done = answer("collect", protocol, "--rig", rig, "--store", folder / "store")
     assert (done["committed"], done["missing"]) == (1, 0)
     assert answer("label", folder / "store")["done"] == 1
-    return Store.open(folder / "store")
+    return TrialStore.open(folder / "store")
 
 
 def test_slip_is_looked_for_in_all_moves_in_contact(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_twist_of_an_abb_arm_is_labelled_as_it_was(tmp_path: Path) -> None:
     done = answer("collect", protocol, "--rig", abb_yaml(tmp_path), "--store", store)
     assert (done["committed"], done["missing"]) == (1, 0)
     assert answer("label", store)["done"] == 1
-    (recording,) = Store.open(store).campaign("press_twist").recordings()
+    (recording,) = TrialStore.open(store).campaign("press_twist").recordings()
     begin, end = recording.motion_ns
     assert (end - begin) / 1e9 == pytest.approx(40 / 10, abs=0.3)
     agrees(recording, store)

@@ -17,7 +17,7 @@ from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.storage.errors import masked
 from sliplab.storage.files import read_json
 from sliplab.storage.process import this_process
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.conftest import ROOT
 from tests.storage.trial_files import campaign, commit
 
@@ -55,7 +55,7 @@ def test_nothing_of_it_stays_in_a_store(
     monkeypatch.setattr(sys, "argv", ["sliplab", "collect", f"s3://key:{SECRET}@host/x"])
     where = campaign(tmp_path / "store")
     folder = commit(where, "t")
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     error = OSError(f"cannot reach {os.environ['PREFECT_API_URL']}")
     with store_lock(store):
         target = where.quarantine(folder, f"{type(error).__name__}: {error}")
@@ -83,7 +83,7 @@ def abb(folder: Path, password: str, **more: str) -> Path:
 
 
 def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
-    protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
+    protocol, store = ROOT / "protocols" / "pilot.yaml", TrialStore.create(tmp_path / "store")
     run_request = make_request(protocol, abb(tmp_path / "lab", SECRET), store.folder)
     assert SECRET in run_request.rig_text
     assert run_request.rig.devices is not None
@@ -103,7 +103,7 @@ def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
 
 
 def test_another_password_is_no_other_rig(tmp_path: Path) -> None:
-    protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
+    protocol, store = ROOT / "protocols" / "pilot.yaml", TrialStore.create(tmp_path / "store")
     run_request = make_request(protocol, abb(tmp_path / "lab", SECRET), store.folder)
     campaign = describe_campaign(store, run_request)
     make_request(protocol, abb(tmp_path / "lab", "another-one"), store.folder)

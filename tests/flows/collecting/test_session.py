@@ -14,7 +14,7 @@ from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import at_rig, requested, take_all, tiny, tiny_gravity, write
@@ -70,7 +70,7 @@ def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
         assert part.taken == 1
     assert pieces is not None
     assert checksums(pieces) == expected
-    assert verify(Store.open(tmp_path / "b" / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "b" / "store")) == []
 
 
 def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_another_collection_or_rig_is_refused_and_new_trials_are_not(tmp_path: P
     data["analysis"]["detection"]["margin"] = 5
     data["collection"]["factors"]["direction"]["values"].append(300)
     run_request = make_request(write(tmp_path / "more.yaml", data), rig, store)
-    assert len(pending_trials(run_request.plan, Store.open(store).campaign("tiny"))) == 1
+    assert len(pending_trials(run_request.plan, TrialStore.open(store).campaign("tiny"))) == 1
     data["collection"]["motion"][1]["speed"] = "1 mm/s"
     with pytest.raises(StoreError, match="another `collection:` section"):
         make_request(write(tmp_path / "other.yaml", data), rig, store)

@@ -15,7 +15,7 @@ from sliplab.flows.running import stopping
 from sliplab.rigs.core.rig import Rig
 from sliplab.storage.trials import checksums, store, writer
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from sliplab.storage.trials.writer import TrialWriter
 from tests.command_line import here
@@ -50,8 +50,8 @@ def interrupted(wanted: RunRequest) -> Campaign:
     """Collect until the signal; what is left is clean."""
     with pytest.raises(KeyboardInterrupt), stopping.signals():
         collect(wanted)
-    assert verify(Store.open(wanted.store)) == []
-    return Store.open(wanted.store).campaign(NAME)
+    assert verify(TrialStore.open(wanted.store)) == []
+    return TrialStore.open(wanted.store).campaign(NAME)
 
 
 @pytest.mark.quick(2)
@@ -146,7 +146,7 @@ def test_verify_names_the_trial_that_is_being_recorded(
     original = Rig.run_trial
 
     def run_trial(*arguments: Any, **options: Any) -> Any:
-        seen.append((verify(Store.open(wanted.store)), here("verify", wanted.store)))
+        seen.append((verify(TrialStore.open(wanted.store)), here("verify", wanted.store)))
         return original(*arguments, **options)
 
     monkeypatch.setattr(Rig, "run_trial", run_trial)
@@ -156,7 +156,7 @@ def test_verify_names_the_trial_that_is_being_recorded(
     assert f"is being recorded by pid {os.getpid()}" in problem.what
     assert done.returncode == 0
     assert "is being recorded" in done.stderr
-    assert verify(Store.open(wanted.store)) == []
+    assert verify(TrialStore.open(wanted.store)) == []
 
 
 def test_verify_counts_an_unfinished_trial_as_no_damage(wanted: RunRequest) -> None:
@@ -168,6 +168,6 @@ def test_verify_counts_an_unfinished_trial_as_no_damage(wanted: RunRequest) -> N
     assert (done.returncode, done.stdout.strip()) == (0, f"{TRIALS} trials, all intact")
     assert f"{left}: is an unfinished trial" in done.stderr
     with exclusive(wanted.store / STORE_LOCK, "the store", about={"collects": "another"}):
-        assert [item.kind for item in verify(Store.open(wanted.store))] == ["unfinished"]
+        assert [item.kind for item in verify(TrialStore.open(wanted.store))] == ["unfinished"]
     next(folder.glob("trials/*/data.h5")).write_bytes(b"")
     assert here("verify", wanted.store).returncode == 1

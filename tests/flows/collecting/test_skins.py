@@ -26,7 +26,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import control
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.context import LoggedContext
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import answer, here
 from tests.conftest import ROOT
@@ -37,17 +37,17 @@ from tests.patching import put
 from tests.storage.trial_files import campaign as plain_campaign
 
 
-def logging(work: TrialCollector, campaign: Campaign, store: Store) -> TrialCollector:
+def logging(work: TrialCollector, campaign: Campaign, store: TrialStore) -> TrialCollector:
     """Let a session read the log, as `open_session` does."""
     work.context = LoggedContext(store, campaign.name).read
     return work
 
 
 @pytest.fixture
-def two_skins(tmp_path: Path) -> tuple[Store, Campaign]:
+def two_skins(tmp_path: Path) -> tuple[TrialStore, Campaign]:
     """One trial with the rig file's skin; two with 0043, the last of them of another session."""
     work, campaign = session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     logging(work, campaign, store)
     trials = pending_trials(work.plan, campaign)
     work.take(trials[:1])
@@ -58,7 +58,7 @@ def two_skins(tmp_path: Path) -> tuple[Store, Campaign]:
     return store, campaign
 
 
-def test_every_trial_from_then_on_has_the_skin(two_skins: tuple[Store, Campaign]) -> None:
+def test_every_trial_from_then_on_has_the_skin(two_skins: tuple[TrialStore, Campaign]) -> None:
     store, campaign = two_skins
     first, *others = (campaign.recording(t.id) for t in Collected(campaign).plan)
     assert "context" not in json.loads((first.folder / "record.json").read_text())
@@ -80,7 +80,7 @@ def test_every_trial_from_then_on_has_the_skin(two_skins: tuple[Store, Campaign]
 
 def test_depth_zero_is_found_again_with_another_skin(tmp_path: Path) -> None:
     work, campaign = session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     logging(work, campaign, store)
     zeros: list[int] = []
     found = work.rig.rezero
@@ -102,7 +102,7 @@ def test_depth_zero_is_found_again_with_another_skin(tmp_path: Path) -> None:
 
 
 def test_the_log_and_the_status_name_the_skin_and_what_it_asks_for(
-    two_skins: tuple[Store, Campaign],
+    two_skins: tuple[TrialStore, Campaign],
 ) -> None:
     store, _ = two_skins
     (entry,) = (each for each in log_entries(store) if each.what == "context")
@@ -118,7 +118,7 @@ def test_one_list_names_what_belongs_to_the_old_skin(tmp_path: Path) -> None:
     data = with_references()
     data["collection"]["maintenance"].pop("rezero")
     _, campaign = session(tmp_path, data)
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     rig = json.loads((campaign.folder / "rig.yaml").read_text())
     rig["calibration"]["depth_zero"] = {
         "zero": "0.01 mm",
@@ -143,7 +143,7 @@ def test_one_list_names_what_belongs_to_the_old_skin(tmp_path: Path) -> None:
     assert "old" in texts[3]
 
 
-def test_a_check_names_what_the_new_skin_lacks(two_skins: tuple[Store, Campaign]) -> None:
+def test_a_check_names_what_the_new_skin_lacks(two_skins: tuple[TrialStore, Campaign]) -> None:
     store, _ = two_skins
     folder = store.folder.parent
     found = preflight.check(folder / "p.yaml", folder / "rig.yaml", store.folder, ())
@@ -156,7 +156,7 @@ def test_references_are_compared_within_a_skin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, campaign, run_request = begin(tmp_path / "a", with_references())
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     logging(work, campaign, store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
     references = [trial.id for trial in run_request.plan if trial.role == "reference"]
@@ -175,7 +175,7 @@ def test_references_are_compared_within_a_skin(
 
 
 def test_a_split_holds_out_a_logged_skin_and_the_report_says_where_skins_mix(
-    two_skins: tuple[Store, Campaign],
+    two_skins: tuple[TrialStore, Campaign],
 ) -> None:
     store, campaign = two_skins
     mixed = Collected(campaign)
@@ -215,7 +215,7 @@ def test_what_cannot_be_logged_is_refused(
     tmp_path: Path, context: dict[str, str], says: str
 ) -> None:
     session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     with pytest.raises(ValueError, match=says):
         add_note(store, "", context=context)
     assert log_entries(store) == []
@@ -225,7 +225,7 @@ def test_a_context_with_one_level_may_change_in_its_unit(tmp_path: Path) -> None
     data = short()
     data["collection"]["context"] = {"width": {"unit": "mm", "values": [40]}}
     work, campaign = session(tmp_path, data)
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     with pytest.raises(InputError, match="number with a unit"):
         add_note(store, "", context={"width": "41"})
     add_note(store, "", context={"width": "4.1 cm"})
@@ -236,17 +236,17 @@ def test_a_context_with_one_level_may_change_in_its_unit(tmp_path: Path) -> None
 
 
 def test_without_a_campaign_there_is_nothing_to_change(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     with pytest.raises(ValueError, match="no campaign has begun"):
         add_note(store, "", context={"skin": "0043"})
     plain_campaign(tmp_path / "t", "c")
     with pytest.raises(InputError, match="is no campaign"):
-        add_note(Store.open(tmp_path / "t"), "", context={"skin": "1"}, campaigns=["d"])
+        add_note(TrialStore.open(tmp_path / "t"), "", context={"skin": "1"}, campaigns=["d"])
 
 
 def test_a_damaged_log_stops_a_collection_that_cannot_know_its_skin(tmp_path: Path) -> None:
     work, campaign = session(tmp_path, short())
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     add_note(store, "", context={"skin": "0043"})
     (store.folder / "log" / "000001.json").write_text("{")
     logging(work, campaign, store)
@@ -277,12 +277,12 @@ def test_a_rig_file_with_a_skin_that_was_not_logged_is_named(tmp_path: Path) -> 
     asked = tmp_path / "p.yaml", rig, tmp_path / "store"
     with pytest.raises(StoreError, match=r"log it with `sliplab log .* --skin 0043`"):
         make_request(*asked)
-    add_note(Store.open(tmp_path / "store"), "", context={"skin": "0043"})
+    add_note(TrialStore.open(tmp_path / "store"), "", context={"skin": "0043"})
     assert make_request(*asked).rig.skin.serial == "0043"
 
 
 def test_the_command_refuses_what_it_cannot_keep(tmp_path: Path) -> None:
-    Store.create(tmp_path / "s")
+    TrialStore.create(tmp_path / "s")
     for given, says in (
         (("x", "--who", ""), "--who = '': must be a name"),
         (("x\ny",), "must be one line without control characters"),

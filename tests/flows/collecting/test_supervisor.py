@@ -16,11 +16,11 @@ from sliplab.flows.collecting.supervisor import CollectionSupervisor, WindowOver
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
-from sliplab.protocols import Trial
+from sliplab.protocols import PlannedTrial
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import skipped
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.crash import campaign as crash
@@ -31,10 +31,10 @@ from tests.patching import put
 
 def supervised(
     folder: Path, data: dict[str, Any] | None = None, **mock: Any
-) -> tuple[TrialCollector, Campaign, Store]:
+) -> tuple[TrialCollector, Campaign, TrialStore]:
     """A collector with a supervisor, whose waits fail unless a test says what happens in them."""
     work, campaign = session(folder, data or short(), **mock)
-    store = Store.open(folder / "store")
+    store = TrialStore.open(folder / "store")
     work.supervisor = CollectionSupervisor(requested(folder), store, campaign)
 
     def never(seconds: float) -> None:
@@ -48,7 +48,7 @@ def after_first(work: TrialCollector, do: Callable[[], object]) -> list[tuple[st
     """Take what is pending; `do` is called during the first trial; return outcomes."""
     outcomes: list[tuple[str, str]] = []
 
-    def on_trial(trial: Trial, outcome: str) -> None:
+    def on_trial(trial: PlannedTrial, outcome: str) -> None:
         if not outcomes:
             do()
         outcomes.append((trial.id, outcome))
@@ -228,7 +228,7 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
 
     with pytest.raises(WindowOver, match="the next collection continues"):
         night()
-    store = Store.open(wanted.store).campaign(crash.NAME)
+    store = TrialStore.open(wanted.store).campaign(crash.NAME)
     assert 1 <= len(store.committed()) <= 3  # retakes ask as well
     assert not list((store.folder / "incoming").iterdir())
     crash.collect(wanted)
@@ -240,17 +240,17 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
 def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:
     wanted = replace(crash.run_request(tmp_path, 2), until=500.0)
     with open_session(wanted) as work:
-        control.ask(Store.open(wanted.store), "pause")
+        control.ask(TrialStore.open(wanted.store), "pause")
         work.supervisor.clock, work.supervisor.wait = after(3), lambda seconds: None
         with pytest.raises(WindowOver):
             work.collector.take(work.trials)
-    assert control.paused(Store.open(wanted.store)) is not None
+    assert control.paused(TrialStore.open(wanted.store)) is not None
 
 
 def test_in_real_time_no_trial_is_begun_that_would_not_be_over(tmp_path: Path) -> None:
     mock = crash.run_request(tmp_path, 2)
     loopback, text = load_rig_file(ROOT / "rigs" / "loopback.yaml")
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     for rig, needed in ((mock.rig, 0.0), (loopback, None)):
         wanted = RunRequest(mock.plan, rig, text, store.folder, "c", (), until=500.0)
         supervisor = CollectionSupervisor(wanted, store, describe_campaign(store, wanted))

@@ -14,7 +14,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 
@@ -28,7 +28,7 @@ def test_a_trial_of_127_pins_passes_its_gates_and_is_labelled(tmp_path: Path) ->
     data["analysis"]["split"] = {"method": "ranked"}
     request = make_request(write(tmp_path / "tiny.yaml", data), RIG, tmp_path / "store")
     assert collect(request)["committed"] == 1
-    (item,) = collected(Store.open(tmp_path / "store"))
+    (item,) = collected(TrialStore.open(tmp_path / "store"))
     ((_, recording),) = item.trials
     record = recording.record
     assert len(record.geometry.skin_mm) == 127

@@ -15,11 +15,11 @@ from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.disk_space import RESERVE
-from sliplab.flows.planning.estimate import trial_bytes
 from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.planning.size_estimate import trial_bytes
 from sliplab.protocols import InputError, load_plan
 from sliplab.storage.trials import control
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import requested, tiny, write
@@ -35,7 +35,7 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     work, campaign, run_request = begin(tmp_path / "a", short())
     left = [RESERVE + 1e9, RESERVE + 1e9, RESERVE + 1000]
     disk = DiskWatch(run_request, campaign, lambda folder: int(left.pop(0)))
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign, disk)
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
@@ -49,7 +49,7 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     assert len(campaign.committed()) == 2
     assert campaign.quarantined() == []
     assert not list((campaign.folder / "incoming").iterdir())
-    assert verify(Store.open(run_request.store)) == []
+    assert verify(TrialStore.open(run_request.store)) == []
 
 
 def test_what_a_trial_needs_comes_from_the_plan_then_from_the_trials(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_references_that_drift_apart_stop_the_campaign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, campaign, run_request = begin(tmp_path / "a", with_references())
-    store = Store.open(run_request.store)
+    store = TrialStore.open(run_request.store)
     work.supervisor = CollectionSupervisor(run_request, store, campaign)
     references = [trial.id for trial in run_request.plan if trial.role == "reference"]
     first, second = references[:2]
@@ -123,7 +123,9 @@ def test_references_that_drift_apart_stop_the_campaign(
 
 def test_true_event_rates_in_the_hold_agree_within_some_percent(tmp_path: Path) -> None:
     work, campaign, run_request = begin(tmp_path / "a", with_references())
-    work.supervisor = CollectionSupervisor(run_request, Store.open(run_request.store), campaign)
+    work.supervisor = CollectionSupervisor(
+        run_request, TrialStore.open(run_request.store), campaign
+    )
     work.take(pending_trials(work.plan, campaign))
     rates = [
         hold_rate(campaign.recording(trial.id))
@@ -146,7 +148,9 @@ def test_without_the_gate_nothing_is_compared(
         raise AssertionError("read")
 
     monkeypatch.setattr("sliplab.analysis.references.hold_rate", never)
-    work.supervisor = CollectionSupervisor(run_request, Store.open(run_request.store), campaign)
+    work.supervisor = CollectionSupervisor(
+        run_request, TrialStore.open(run_request.store), campaign
+    )
     work.take(pending_trials(work.plan, campaign)[:3])
     ReferenceWatch(run_request, campaign).begin()
 

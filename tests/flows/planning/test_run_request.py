@@ -11,7 +11,7 @@ import yaml
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.trial_files import commit
@@ -19,10 +19,10 @@ from tests.storage.trial_files import commit
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
-def begin(folder: Path, data: dict[str, Any]) -> Store:
+def begin(folder: Path, data: dict[str, Any]) -> TrialStore:
     """A store in which a campaign under `data` was begun."""
     run_request = make_request(write(folder / "p.yaml", data), RIG, folder / "store")
-    store = Store.create(folder / "store")
+    store = TrialStore.create(folder / "store")
     describe_campaign(store, run_request)
     return store
 

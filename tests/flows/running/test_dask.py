@@ -28,7 +28,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.remote.mirror import open_mirror
 from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import push
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.listening import listening
@@ -89,7 +89,7 @@ def cluster(address: str) -> Iterator[Cluster]:
 
 def run_steps(folder: Path, cluster: Cluster | None) -> dict[str, bytes]:
     """Every file that the steps made."""
-    store = Store.open(folder)
+    store = TrialStore.open(folder)
     for step in STEPS:
         result = step(store, collected(store), cluster=cluster)
         assert result["done"]
@@ -178,7 +178,7 @@ def test_a_pushed_store_is_labelled_where_its_trials_are_fetched(
 ) -> None:
     monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
     url = f"file://{tmp_path}/shared"
-    push(Store.open(taken), Remote(url))
+    push(TrialStore.open(taken), Remote(url))
     store, _ = open_mirror(url)
     assert label(store, collected(store), cluster)["done"] == 6
     labels = {name: data for name, data in here.items() if name.startswith("derived/labels")}
@@ -192,7 +192,7 @@ def test_what_cannot_be_used_is_said_at_once(
 ) -> None:
     with pytest.raises(InputError, match="HOST:PORT"), connected("nonsense"):
         pass
-    store = Store.open(taken)
+    store = TrialStore.open(taken)
     with connected(address) as found, monkeypatch.context() as patch:
         patch.setattr(parallel_map, "place_of", lambda _: str(tmp_path / "elsewhere"))
         with pytest.raises(ClusterError, match=r"worker tcp://.* is not a store .*same path"):

@@ -17,7 +17,7 @@ from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
 from sliplab.flows.running.orchestration import WorkNotBegun, run
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import SLIPLAB, answer, here
 from tests.conftest import ROOT
 from tests.flows.programs import NO_SERVER, ended, environment
@@ -63,7 +63,7 @@ def counted(done: list[str]) -> int:
 
 @pytest.fixture
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(orchestration, "_store", Store.create(tmp_path).folder)
+    monkeypatch.setattr(orchestration, "_store", TrialStore.create(tmp_path).folder)
     return tmp_path
 
 
@@ -241,5 +241,5 @@ def test_label_in_a_script_without_a_guard_collects_once(tmp_path: Path) -> None
     done = ended(command, 300, cwd=tmp_path, env=environment(**NO_SERVER))
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["1"]
-    (campaign,) = Store.open(tmp_path / "store").campaigns()
+    (campaign,) = TrialStore.open(tmp_path / "store").campaigns()
     assert len(campaign.committed()) == 1

@@ -20,7 +20,7 @@ from sliplab.flows.label import label
 from sliplab.flows.running import parallel_map
 from sliplab.flows.running.parallel_map import WorkerKilled
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import SLIPLAB
 from tests.flows.conftest import six_trials
 from tests.flows.programs import ended, running
@@ -92,7 +92,7 @@ def test_every_step_goes_on_after_it_was_killed(
 def test_a_worker_process_that_is_killed_is_said_and_the_rest_is_made(
     taken: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = Store.open(taken)
+    store = TrialStore.open(taken)
     for path in (taken / "derived" / "labels").rglob("*"):
         if path.is_file():
             path.unlink()

@@ -15,7 +15,7 @@ from sliplab.plugins.adapters.trials import find_trials
 from sliplab.protocols.adapter import load_adapter
 from sliplab.protocols.errors import InputError
 from sliplab.storage.formats.data_folder import DataFolder
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 
 COUNTS: dict[str, Any] = yaml.safe_load("""
@@ -69,7 +69,7 @@ def bring(adapter: dict[str, Any], path: Path, store: Path, text: str | None = N
     file.write_text(yaml.safe_dump(adapter) if text is None else text)
     read = load_adapter(file)
     found = find_trials(read, file, DataFolder(path))
-    opened = Store.create(store)
+    opened = TrialStore.create(store)
     done = import_adapted(opened, read.name, found, file.read_text())
     for item in done.get("failed", ()):
         raise InputError(item["file"], "", None, item["reason"])

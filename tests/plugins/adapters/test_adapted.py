@@ -23,7 +23,7 @@ from sliplab.storage.errors import DamagedFile
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.tables import read_columns
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
@@ -238,13 +238,13 @@ def test_an_import_lists_first_then_adds_what_is_new(tmp_path: Path) -> None:
     file.write_text(yaml.safe_dump({**COUNTS, "title": "Later", "split": {"together": "object"}}))
     again = json.loads(here(*line).stdout)
     assert (again["imported"], len(again["there"])) == (["train-sample_7_label_1"], 6)
-    campaign = Store.open(tmp_path / "store").campaign("touch")
+    campaign = TrialStore.open(tmp_path / "store").campaign("touch")
     assert "Later" in campaign.protocol_file.read_text()
     file.write_text(yaml.safe_dump({**COUNTS, "labels": {}}))
     refused = here(*line)
     assert refused.returncode == 2
     assert "labels: differs from the adapter of campaign 'touch'" in refused.stderr
-    assert not verify(Store.open(tmp_path / "store"))
+    assert not verify(TrialStore.open(tmp_path / "store"))
 
 
 def test_a_table_without_a_heading_keeps_its_first_row(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_what_is_committed_stays_when_an_import_is_stopped(tmp_path: Path) -> No
     file = tmp_path / "adapter.yaml"
     file.write_text(yaml.safe_dump(COUNTS))
     found = find_trials(load_adapter(file), file, DataFolder(tmp_path / "set"))
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     left = iter(range(2))
 
     def stop(trial: str) -> None:
@@ -290,7 +290,7 @@ def test_of_a_damaged_file_what_stands_whole_is_taken_with_its_labels(tmp_path: 
         "adapter: 1\nname: slips\nexperiment: classes\ntrials: {files: '{object}.aedat4'}\n"
         "streams: {events: {format: aedat4}}\nlabels: {class: '{object}'}\n"
     )
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     with closing(DataFolder(folder)) as opened:
         found = find_trials(load_adapter(file), file, opened)
         with pytest.raises(

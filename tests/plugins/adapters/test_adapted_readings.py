@@ -15,7 +15,7 @@ from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.protocols.adapter import Adapter
 from sliplab.storage.formats.export_trials import export_trials
 from sliplab.storage.trials.catalogue import catalogue
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.plugins.adapters.adapters import bring
@@ -110,8 +110,8 @@ def test_counts_of_a_table_of_readings_say_what_to_write(tmp_path: Path) -> None
 @pytest.mark.long
 def test_later_steps_give_a_result_or_one_line(campaign: Campaign, tmp_path: Path) -> None:
     store = tmp_path / "store"
-    assert verify(Store.open(store)) == []
-    assert catalogue(Store.open(store))["events"].tolist() == [0] * 8
+    assert verify(TrialStore.open(store)) == []
+    assert catalogue(TrialStore.open(store))["events"].tolist() == [0] * 8
     assert here("verify", store).returncode == 0
     for kind, said in (("aedat4", "neither events nor a video"), ("dsec", "has no events")):
         done = here("export", store, "pressures", "--output", tmp_path / kind, "--format", kind)

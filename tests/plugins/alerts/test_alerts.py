@@ -19,7 +19,8 @@ from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreS
 from sliplab.plugins.alerts.conditions import Event, events
 from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
-from sliplab.plugins.alerts.watcher import AlertWatcher, AppriseTarget
+from sliplab.plugins.alerts.targets import AppriseTarget
+from sliplab.plugins.alerts.watcher import AlertWatcher
 from sliplab.plugins.web.server.schedules import has_alerts
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import mask_secrets
@@ -27,7 +28,7 @@ from sliplab.rigs.rig_file import load_rig_file, same_rig
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.plugins.alerts.receivers import http_server, mail_server
@@ -69,12 +70,12 @@ def state(**changes: Any) -> StoreStatus:
     return replace(one, **changes)
 
 
-def found(store: Store, at: StoreStatus, now: datetime = NOW, **changes: Any) -> list[Event]:
+def found(store: TrialStore, at: StoreStatus, now: datetime = NOW, **changes: Any) -> list[Event]:
     return list(events(store, at, settings(**changes), now))
 
 
 def watcher(
-    store: Store, receivers: list[Receiver], now: datetime = NOW, **changes: Any
+    store: TrialStore, receivers: list[Receiver], now: datetime = NOW, **changes: Any
 ) -> tuple[AlertWatcher, list[str]]:
     pinged: list[str] = []
     made = AlertWatcher(
@@ -99,7 +100,7 @@ RUNNING = CampaignStatus(
 
 def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     tiny = campaign(tmp_path / "s", "tiny")
-    store = Store.open(tmp_path / "s")
+    store = TrialStore.open(tmp_path / "s")
     run = str(uuid4())
     run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
     run_records.end(store.folder, run, "FAILED", "the arm did not answer", "flow")
@@ -144,20 +145,22 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
 def test_a_wait_that_is_expected_is_not_idle(
     tmp_path: Path, changes: dict[str, Any], at: StoreStatus
 ) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     assert "idle" not in {item.kind for item in found(store, at, **changes)}
 
 
 def test_a_drift_that_is_not_known_is_reported(tmp_path: Path) -> None:
     lost = replace(RUNNING, drift=[DriftStatus("friction", None, 10.0, "r2")])
-    kinds = {item.kind for item in found(Store.create(tmp_path / "s"), state(campaigns=[lost]))}
+    kinds = {
+        item.kind for item in found(TrialStore.create(tmp_path / "s"), state(campaigns=[lost]))
+    }
     assert "drift" in kinds
 
 
 def test_nothing_is_lost_while_a_receiver_is_down_and_nothing_is_told_twice(
     tmp_path: Path,
 ) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     up, down = Receiver("json://a"), Receiver("json://b", up=False)
     watching, _ = watcher(store, [up, down])
     run = str(uuid4())
@@ -188,7 +191,7 @@ def test_a_target_that_never_answers_delays_no_other(tmp_path: Path) -> None:
             return super().send(title, text)
 
     hanging, other = Hanging("json://a"), Receiver("json://b")
-    box = Outbox(Store.create(tmp_path / "s"), [hanging, other], 30, NOW, lambda text: None)
+    box = Outbox(TrialStore.create(tmp_path / "s"), [hanging, other], 30, NOW, lambda text: None)
     for number in range(3):
         now = NOW + timedelta(seconds=number)
         box.add(Event(str(number), "paused", f"event {number}", now), urgent=True)
@@ -205,7 +208,7 @@ def test_a_target_that_never_answers_delays_no_other(tmp_path: Path) -> None:
 
 def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Path) -> None:
     one, other = Receiver("tgram://****"), Receiver("tgram://****", up=False)
-    box = Outbox(Store.create(tmp_path / "s"), [one, other], 30, NOW, lambda text: None)
+    box = Outbox(TrialStore.create(tmp_path / "s"), [one, other], 30, NOW, lambda text: None)
     box.add(Event("a", "paused", "text", NOW), urgent=True)
     box.send("t", NOW)
     other.up = True
@@ -214,7 +217,7 @@ def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Pat
 
 
 def test_a_run_that_was_killed_is_told_once(tmp_path: Path) -> None:
-    store, receiver = Store.create(tmp_path / "s"), Receiver()
+    store, receiver = TrialStore.create(tmp_path / "s"), Receiver()
     watching, _ = watcher(store, [receiver])
     run = str(uuid4())
     run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
@@ -231,7 +234,7 @@ def test_a_run_that_was_killed_is_told_once(tmp_path: Path) -> None:
 
 def test_a_grade_that_fell_between_two_looks_is_told(tmp_path: Path) -> None:
     tiny = campaign(tmp_path / "s", "tiny")
-    store, receiver = Store.open(tmp_path / "s"), Receiver()
+    store, receiver = TrialStore.open(tmp_path / "s"), Receiver()
     began = datetime.now().astimezone() - timedelta(minutes=1)
     watching, _ = watcher(store, [receiver], began)
     for number, grade in enumerate(("digital input", "host time", "digital input")):
@@ -248,7 +251,7 @@ def test_a_grade_that_fell_between_two_looks_is_told(tmp_path: Path) -> None:
 
 
 def test_a_summary_that_was_missed_is_sent_later_that_day(tmp_path: Path) -> None:
-    store, receiver = Store.create(tmp_path / "s"), Receiver()
+    store, receiver = TrialStore.create(tmp_path / "s"), Receiver()
     watcher(store, [receiver], NOW - timedelta(days=2))  # alerts began then
     watching, _ = watcher(store, [receiver], summary="07:30")
     watching.look(NOW)
@@ -257,7 +260,7 @@ def test_a_summary_that_was_missed_is_sent_later_that_day(tmp_path: Path) -> Non
 
 
 def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     receiver = Receiver()
     box = Outbox(store, [receiver], 30, NOW, lambda text: None)
     assert not box.add(Event("a", "paused", "old", NOW - timedelta(seconds=1)), urgent=True)
@@ -268,7 +271,7 @@ def test_what_happened_before_alerts_began_is_not_told(tmp_path: Path) -> None:
 
 
 def test_an_address_that_is_added_later_is_told_nothing_of_before(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     first, second = Receiver("json://a", up=False), Receiver("json://b")
     box = Outbox(store, [first], 30, NOW, lambda text: None)
     box.add(Event("a", "paused", "before", NOW), urgent=True)
@@ -288,7 +291,7 @@ def test_quiet_hours_hold_all_but_urgent_messages(tmp_path: Path) -> None:
     assert not quiet.is_quiet(datetime(2030, 3, 2, 20, 59, tzinfo=UTC))
     assert not quiet.is_quiet(datetime(2030, 3, 3, 6, 0, tzinfo=UTC))
     receiver = Receiver()
-    box = Outbox(Store.create(tmp_path / "s"), [receiver], 30, NOW, lambda text: None)
+    box = Outbox(TrialStore.create(tmp_path / "s"), [receiver], 30, NOW, lambda text: None)
     box.add(Event("a", "paused", "later", NOW), urgent=False)
     box.add(Event("b", "disk", "at once", NOW), urgent=True)
     box.send("t", NOW, quiet=True)
@@ -299,7 +302,7 @@ def test_quiet_hours_hold_all_but_urgent_messages(tmp_path: Path) -> None:
 
 def test_a_flood_becomes_one_message(tmp_path: Path) -> None:
     receiver = Receiver()
-    box = Outbox(Store.create(tmp_path / "s"), [receiver], 3, NOW, lambda text: None)
+    box = Outbox(TrialStore.create(tmp_path / "s"), [receiver], 3, NOW, lambda text: None)
     for number in range(50):
         now = NOW + timedelta(minutes=number)
         box.add(Event(str(number), "trial set aside", f"trial {number}", now), urgent=False)
@@ -311,7 +314,7 @@ def test_a_flood_becomes_one_message(tmp_path: Path) -> None:
 
 def test_a_summary_is_sent_once_a_day_and_a_ping_after_each_trial_and_hour(tmp_path: Path) -> None:
     tiny = campaign(tmp_path / "s", "tiny")
-    store, receiver = Store.open(tmp_path / "s"), Receiver()
+    store, receiver = TrialStore.open(tmp_path / "s"), Receiver()
     watching, pinged = watcher(store, [receiver], summary="22:00", ping="http://localhost/x")
     for minute in range(0, 50, 10):
         watching.look(NOW + timedelta(minutes=minute))
@@ -387,7 +390,7 @@ def test_messages_arrive_by_http_and_by_mail() -> None:
 
 
 def test_the_command_sends_a_test_message_and_says_who_took_it(tmp_path: Path) -> None:
-    Store.create(tmp_path / "s")
+    TrialStore.create(tmp_path / "s")
     with http_server() as (port, posted):
         file = write(tmp_path, to=[f"json://u:hunter2@127.0.0.1:{port}"])
         done = here("alerts", tmp_path / "s", file, "--test")

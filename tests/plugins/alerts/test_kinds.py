@@ -17,11 +17,12 @@ from sliplab.flows.running import run_records
 from sliplab.flows.status import StatusReader, StoreStatus
 from sliplab.plugins.alerts import watcher
 from sliplab.plugins.alerts.settings import KINDS
-from sliplab.plugins.alerts.watcher import POLL_S, AlertWatcher, AppriseTarget
+from sliplab.plugins.alerts.targets import AppriseTarget
+from sliplab.plugins.alerts.watcher import POLL_S, AlertWatcher
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.checksums import RECORD
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.alerts.receivers import http_server, mail_server
 from tests.plugins.alerts.test_alerts import RUNNING, Receiver, settings, state
 from tests.rigs.waiting import free_port
@@ -29,7 +30,7 @@ from tests.storage.trial_files import campaign, commit, fail
 
 WITHIN_S = 10.0
 DOWN_S = 300
-Cause = Callable[[Store], StoreStatus]
+Cause = Callable[[TrialStore], StoreStatus]
 """Lets something happen in a store, and returns its state then."""
 
 
@@ -50,25 +51,25 @@ class Row:
     urgent: bool = False
 
 
-def run_fails(store: Store) -> StoreStatus:
+def run_fails(store: TrialStore) -> StoreStatus:
     run = str(uuid4())
     run_records.begin(store.folder, run, "collect", run_records.EMBEDDED, "nightly")
     run_records.end(store.folder, run, "FAILED", "the arm did not answer", "flow")
     return state()
 
 
-def pause(store: Store) -> StoreStatus:
+def pause(store: TrialStore) -> StoreStatus:
     control.ask(store, "pause", who="anna", why="lunch")
     return state()
 
 
-def set_aside(store: Store) -> StoreStatus:
+def set_aside(store: TrialStore) -> StoreStatus:
     for attempt in (1, 2, 3):
         fail(store.campaign("tiny"), "b", attempt)
     return state()
 
 
-def grade_falls(store: Store) -> StoreStatus:
+def grade_falls(store: TrialStore) -> StoreStatus:
     for name, grade in (("t0", "digital input"), ("t1", "host time")):
         path = commit(store.campaign("tiny"), name) / RECORD
         record = read_json(path)
@@ -77,21 +78,21 @@ def grade_falls(store: Store) -> StoreStatus:
     return state()
 
 
-def idle(store: Store) -> StoreStatus:
+def idle(store: TrialStore) -> StoreStatus:
     since = datetime.now().astimezone().isoformat()
     item = replace(RUNNING, last_ended=since, drift=[], nights_of_disk=None)
     return state(collects="tiny", since=since, campaigns=[item])
 
 
-def drift(store: Store) -> StoreStatus:
+def drift(store: TrialStore) -> StoreStatus:
     return state(campaigns=[replace(RUNNING, nights_of_disk=None)])
 
 
-def disk(store: Store) -> StoreStatus:
+def disk(store: TrialStore) -> StoreStatus:
     return state(campaigns=[replace(RUNNING, drift=[])])
 
 
-def done(store: Store) -> StoreStatus:
+def done(store: TrialStore) -> StoreStatus:
     ended = (datetime.now().astimezone() + timedelta(seconds=1)).isoformat()
     item = replace(RUNNING, missing=0, planned=4, drift=[], nights_of_disk=None, last_ended=ended)
     return state(campaigns=[item])
@@ -119,7 +120,7 @@ class Case:
 
     def __init__(self, row: Row, folder: Path, patch: pytest.MonkeyPatch) -> None:
         campaign(folder / "s", "tiny")
-        self.store = Store.open(folder / "s")
+        self.store = TrialStore.open(folder / "s")
         self.now = datetime.now().astimezone() - timedelta(seconds=2)
         self.watch([])  # alerts begin
         found = row.cause(self.store)

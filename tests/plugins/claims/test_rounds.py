@@ -14,7 +14,7 @@ from sliplab.flows.planning.run_request import Claims, RunRequest, make_request
 from sliplab.plugins.claims.document import ChoiceRecord, StoppingRecord
 from sliplab.protocols import InputError
 from sliplab.storage.schema.campaign_end import CHOICES, STOPPING
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.command_line import answer, here
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import short
@@ -76,7 +76,7 @@ def collect(run_request: RunRequest, most: int | None = None) -> list[str]:
 
 def campaign_of(run_request: RunRequest) -> Campaign:
     """The campaign in its store."""
-    return Store.open(run_request.store).campaign(run_request.campaign)
+    return TrialStore.open(run_request.store).campaign(run_request.campaign)
 
 
 def record_of(run_request: RunRequest) -> StoppingRecord:
@@ -278,7 +278,7 @@ def test_through_real_drivers_a_campaign_ends_by_its_claims(tmp_path: Path) -> N
     protocol, store = write(tmp_path / "quick.yaml", data), tmp_path / "store"
     words = ("collect", protocol, "--rig", "loopback", "--store", store)
     taken = answer(*words)["taken"]
-    campaign = Store.open(store).campaign("quick")
+    campaign = TrialStore.open(store).campaign("quick")
     record = StoppingRecord.load(campaign.folder / STOPPING)
     assert (record.verdict, record.looks[-1].taken) == ("settled", taken)
     assert taken < 18

@@ -14,7 +14,7 @@ from sliplab.plugins.claims.document import ClaimState, Look, StoppingRecord
 from sliplab.plugins.claims.section import claims_key, claims_section
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.campaign_end import STOPPING
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def state(low: float | None, **more: Any) -> ClaimState:
@@ -34,11 +34,11 @@ def state(low: float | None, **more: Any) -> ClaimState:
 
 def campaign(
     folder: Path, small: dict[str, Any], looks: tuple[Look, ...] | None
-) -> tuple[Store, list[Collected]]:
+) -> tuple[TrialStore, list[Collected]]:
     """A store with a campaign that has looked at a claim, without its trials."""
     claims = [{"figure": "latency_incipient", "at_most": "90 ms"}]
     small["collection"]["stopping"] = {"claims": claims, "error": 0.1}
-    store = Store.create(folder / "store")
+    store = TrialStore.create(folder / "store")
     found = store.campaign("pilot")
     info: Any = {"name": "pilot", "experiment": "kinematic", "simulated": True, "enabled": []}
     found.update(info, yaml.safe_dump(small, sort_keys=False), "")

@@ -30,7 +30,7 @@ from sliplab.plugins.classes.document import ClassSummary
 from sliplab.plugins.classes.evaluation import class_evaluation_of, whole_recordings
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.command_line import answer, here
 from tests.docs.nonsense import check_refusals
 from tests.flows import class_store as made
@@ -41,7 +41,7 @@ TRIALS = {"train": 10, "validation": 3, "test": 4}
 
 
 @pytest.fixture(scope="module")
-def judged(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def judged(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """A store from labels to its page."""
     folder = tmp_path_factory.mktemp("classes")
     store = class_store(folder / "store", trials=TRIALS, head=adapter(epochs=12))
@@ -52,18 +52,18 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 @pytest.fixture
-def copied(judged: Store, tmp_path: Path) -> Store:
+def copied(judged: TrialStore, tmp_path: Path) -> TrialStore:
     """A copy of it, to be changed at will."""
-    return Store.open(shutil.copytree(judged.folder, tmp_path / "store"))
+    return TrialStore.open(shutil.copytree(judged.folder, tmp_path / "store"))
 
 
-def samples(store: Store, split: str) -> SampleSet:
+def samples(store: TrialStore, split: str) -> SampleSet:
     """The samples of a part of the split."""
     campaigns = collected(store)
     return load_samples(StoreLabels(store), campaigns, split, classes=class_names(campaigns))
 
 
-def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: Store) -> None:
+def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: TrialStore) -> None:
     found = class_evaluation_of(judged)
     scores = found.scores
     assert scores.classes == CLASSES  # box 2 before box 10
@@ -102,7 +102,7 @@ def test_figures_are_those_of_the_chosen_network_on_the_test_recordings(judged: 
     assert sum(row.n for row in scores.by_factor["force"].values()) == len(test)
 
 
-def test_accuracy_by_length_is_that_of_spikes_so_far(judged: Store) -> None:
+def test_accuracy_by_length_is_that_of_spikes_so_far(judged: TrialStore) -> None:
     found = class_evaluation_of(judged)
     fitted = model_file.load(judged.folder / "models" / f"classes-seed{found.seed}.pt")
     test = samples(judged, "test")
@@ -131,7 +131,7 @@ def test_counts_of_a_recordings_windows_are_added_up() -> None:
     assert (true.tolist(), trial.tolist()) == ([0, 0, 1, 2], [0, 1, 1, 1])
 
 
-def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> None:
+def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: TrialStore) -> None:
     folder = judged.folder / "report"
     page = (folder / "index.html").read_text()
     about = ("Classification report", "Objects touched by a skin of six taxels", "CC0", "clocks")
@@ -156,7 +156,7 @@ def test_the_page_says_what_the_data_are_and_how_to_repeat_it(judged: Store) -> 
 
 @pytest.mark.long
 def test_nothing_is_made_twice_and_other_methods_join(
-    copied: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    copied: TrialStore, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(class_baselines, "TAXEL_KINDS", {"gru": TAXEL_KINDS["gru"]})
     monkeypatch.setattr(class_baselines, "CLASS_EPOCHS", 2)
@@ -185,7 +185,7 @@ def test_nothing_is_made_twice_and_other_methods_join(
 
 @pytest.mark.long
 def test_parts_of_one_recording_may_show_several_classes(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     campaign = begin_campaign(store, adapter(), simulated=True)
     rng = np.random.default_rng(2)
     for part, count in TRIALS.items():
@@ -279,7 +279,7 @@ def test_without_test_recordings_there_are_no_figures(tmp_path: Path) -> None:
         report(store, campaigns)
 
 
-def test_a_damaged_or_missing_model_is_asked_for(copied: Store) -> None:
+def test_a_damaged_or_missing_model_is_asked_for(copied: TrialStore) -> None:
     (copied.folder / "models" / "classes-seed1.pt").unlink()
     with pytest.raises(StoreError, match=r"classes-seed1\.pt: is missing or stale"):
         evaluate(copied, collected(copied))
@@ -300,7 +300,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_belongs_to_slip_says_so_in_one_line(judged: Store, command: str) -> None:
+def test_what_belongs_to_slip_says_so_in_one_line(judged: TrialStore, command: str) -> None:
     code, text = REFUSED[command]
     done = here(*command.replace("STORE", str(judged.folder)).split())
     assert done.returncode == code, done.stderr
@@ -309,7 +309,7 @@ def test_what_belongs_to_slip_says_so_in_one_line(judged: Store, command: str) -
     assert "Traceback" not in done.stderr
 
 
-def test_two_reports_on_classes_are_compared(judged: Store) -> None:
+def test_two_reports_on_classes_are_compared(judged: TrialStore) -> None:
     found = here("report", judged.folder, "--against", judged.folder, "--json")
     figures = {row["name"]: row for row in json.loads(found.stdout)["against"]["figures"]}
     assert {
@@ -319,7 +319,7 @@ def test_two_reports_on_classes_are_compared(judged: Store) -> None:
     assert not any(row["difference"] for row in figures.values())
 
 
-def test_classes_and_slip_are_analysed_apart(copied: Store) -> None:
+def test_classes_and_slip_are_analysed_apart(copied: TrialStore) -> None:
     slides = adapter(name="slides", experiment="kinematic", split={})
     del slides["labels"]
     begin_campaign(copied, slides)

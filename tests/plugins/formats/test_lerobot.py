@@ -25,7 +25,7 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.catalogue import catalogue
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.fuzz.mutate import mutate
 from tests.plugins.publish.test_croissant import publication
@@ -138,7 +138,7 @@ def foreign(folder: Path) -> dict[str, Any]:
 def take(store: Path, path: Path) -> Json:
     kind = kind_of(path)
     assert (kind, skipped_in(path, kind)) == ("lerobot", [])
-    result = import_trials(Store.create(store), "theirs", trials_in(path, kind), path, kind)
+    result = import_trials(TrialStore.create(store), "theirs", trials_in(path, kind), path, kind)
     for item in result.get("failed", ()):
         raise InputError(path, "", None, item["reason"])
     return result
@@ -149,7 +149,7 @@ def test_frames_poses_forces_and_scalars_of_every_episode(tmp_path: Path) -> Non
     taken = take(tmp_path / "store", tmp_path / "set")
     assert taken["imported"] == ["episode-000000", "episode-000001"]
     assert (taken["events"], taken["frames"]) == (0, sum(LENGTHS))
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     assert verify(store) == []
     assert catalogue(store)["experiment"].tolist() == ["imported"] * 2
     low = 0
@@ -202,13 +202,13 @@ def test_our_rows_without_the_raw_trials(tmp_path: Path) -> None:
     """What others keep of a data set of ours: rows on the grid, still marked as simulated."""
     where = campaign(tmp_path / "ours")
     _trial(where, "a")
-    ours = Store.open(tmp_path / "ours")
+    ours = TrialStore.open(tmp_path / "ours")
     publish(publication(ours), tmp_path / "out", "lerobot")
     for name in ("campaigns", "store.json"):
         path = tmp_path / "out" / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     take(tmp_path / "store", tmp_path / "out")
-    (trial,) = Store.open(tmp_path / "store").campaign("theirs").recordings()
+    (trial,) = TrialStore.open(tmp_path / "store").campaign("theirs").recordings()
     assert trial.simulated
     table = pq.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
     with trial.open() as reader:
@@ -322,7 +322,7 @@ def test_a_faulty_data_set_ends_in_a_message(fault: str, made: Path, tmp_path: P
     change(path)
     with pytest.raises((InputError, DamagedFile), match=text):
         take(tmp_path / "store", path)
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     assert verify(store) == []
     names = {p.name for where in store.campaigns() for p in (where.folder / "trials").iterdir()}
     assert names <= {"episode-000000"}
@@ -343,7 +343,7 @@ def test_no_damaged_byte_ends_in_a_traceback(made: Path, tmp_path: Path) -> None
         try:
             kind = kind_of(path / "set") if (path / "set/meta/info.json").exists() else "lerobot"
             found = trials_in(path / "set", kind)
-            import_trials(Store.create(path / "store"), "t", found, path / "set", kind)
+            import_trials(TrialStore.create(path / "store"), "t", found, path / "set", kind)
         except InputError as error:
             messages.append(str(error))
         shutil.rmtree(path)
@@ -355,7 +355,7 @@ def test_a_data_set_without_a_camera_is_imported(tmp_path: Path) -> None:
     made = foreign(tmp_path / "set")
     _info(features={"action": {"dtype": "float32", "shape": [2]}})(tmp_path / "set")
     take(tmp_path / "store", tmp_path / "set")
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     assert verify(store) == []
     first = store.campaign("theirs").recording("episode-000000")
     np.testing.assert_array_equal(

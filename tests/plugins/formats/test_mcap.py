@@ -50,7 +50,7 @@ from sliplab.storage.streams import (
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import SYNC, Store
+from sliplab.storage.trials.store import SYNC, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.older import older_store
 from tests.plugins.publish.test_croissant import publication
@@ -70,9 +70,9 @@ SHIFTED = ClockMap.line(5_000_000_000, -3_000_000_000, 20_000).to_json()
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Four labelled slides with tracks; the clocks of one were fitted again."""
-    store = Store.open(older_store(tmp_path_factory.mktemp("older")))
+    store = TrialStore.open(older_store(tmp_path_factory.mktemp("older")))
     (where,) = store.campaigns()
     one = next(where.recordings())
     clocks = one.record.clocks.to_json()
@@ -88,7 +88,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 @pytest.fixture(scope="module")
-def rich(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def rich(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """One trial with every stream there is: further cameras, forces, temperature, a video."""
     where = campaign(tmp_path_factory.mktemp("rich") / "store")
     writer = where.begin("t", FRAME, 50)
@@ -123,7 +123,7 @@ def rich(tmp_path_factory: pytest.TempPathFactory) -> Store:
         record("t", clocks=clocks, streams=streams, steps=steps, geometry=geometry),
         Provenance(host="here", operator="somebody", versions={"sliplab": "0.1.0"}),
     )
-    return Store.open(where.folder.parents[1])
+    return TrialStore.open(where.folder.parents[1])
 
 
 def decoded(path: Path) -> dict[str, list[Any]]:
@@ -153,7 +153,7 @@ def by_hand(packets: list[Any]) -> list[tuple[int, int, int, int]]:
     return found
 
 
-def test_the_official_readers_find_what_the_store_has(rich: Store, tmp_path: Path) -> None:
+def test_the_official_readers_find_what_the_store_has(rich: TrialStore, tmp_path: Path) -> None:
     (where,) = rich.campaigns()
     (ours,) = where.recordings()
     path = tmp_path / "t.mcap"
@@ -222,7 +222,7 @@ def test_the_official_readers_find_what_the_store_has(rich: Store, tmp_path: Pat
     assert attached["rig.yaml"] == (where.folder / "rig.yaml").read_bytes()
 
 
-def test_onsets_are_messages_with_rule_and_doubt(labelled: Store, tmp_path: Path) -> None:
+def test_onsets_are_messages_with_rule_and_doubt(labelled: TrialStore, tmp_path: Path) -> None:
     (where,) = labelled.campaigns()
     one = next(where.recordings())
     write_mcap(tmp_path / "t.mcap", labelled, where, one)
@@ -241,7 +241,7 @@ def test_onsets_are_messages_with_rule_and_doubt(labelled: Store, tmp_path: Path
     assert [t_ns for t_ns, _, _ in onsets] == sorted(t_ns for t_ns, _, _ in onsets)
 
 
-def take(store: Store, path: Path, name: str) -> Json:
+def take(store: TrialStore, path: Path, name: str) -> Json:
     assert kind_of(path) == "mcap"
     return import_trials(store, name, trials_in(path, "mcap"), path, "mcap")
 
@@ -255,7 +255,7 @@ def columns_of(recording: Recording) -> Iterator[tuple[str, Any]]:
                 yield f"{stream} {name}", reader.column(name)
 
 
-def assert_equal(ours: Store, theirs: Store) -> None:
+def assert_equal(ours: TrialStore, theirs: TrialStore) -> None:
     """Hold every trial of two stores against each other: all columns, frames, documents, labels."""
     assert verify(theirs) == []
     assert catalogue(theirs).equals(catalogue(ours))
@@ -294,12 +294,12 @@ def assert_equal(ours: Store, theirs: Store) -> None:
 def test_a_published_store_comes_back_as_it_was(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    ours: Store = request.getfixturevalue(which)
+    ours: TrialStore = request.getfixturevalue(which)
     output = tmp_path / "out"
     result = publish(publication(ours), output, "mcap")
     (where,) = ours.campaigns()
     assert result["trials"] == len(where.committed())
-    theirs = Store.create(tmp_path / "store")
+    theirs = TrialStore.create(tmp_path / "store")
     folder = output / "campaigns" / where.name
     taken = take(theirs, folder, where.name)
     assert len(taken["imported"]) == result["trials"]
@@ -331,9 +331,9 @@ def test_an_imported_campaign_and_one_without_frames_come_back(tmp_path: Path) -
     clock = {"map": IDENTITY}
     clocks = {"reference": "event camera", "events": clock}
     writer.commit(record("t", counts=counts, clocks=clocks, simulated=False), Provenance())
-    ours = Store.open(tmp_path / "store")
+    ours = TrialStore.open(tmp_path / "store")
     publish(publication(ours), tmp_path / "out", "mcap")
-    theirs = Store.create(tmp_path / "again")
+    theirs = TrialStore.create(tmp_path / "again")
     only = of_one_campaign(tmp_path / "out")
     assert only == tmp_path / "out" / "campaigns" / "c"
     assert of_one_campaign(only) is None
@@ -356,7 +356,7 @@ def test_a_recorded_campaign_comes_back_with_its_tables(tmp_path: Path) -> None:
             trial.push("wrong", 10**12 - k * 10**10, k)
             trial.push("events", None, 1, 2, 1)
             waited_for(trial, "pull", k + 1)
-    ours = Store.open(tmp_path / "store")
+    ours = TrialStore.open(tmp_path / "store")
     (found,) = ours.campaign("c").recordings()
     assert "wrong" in found.clocks.refused
     arrays = open_store(tmp_path / "store").trial(trial.id).to_dict()
@@ -367,7 +367,7 @@ def test_a_recorded_campaign_comes_back_with_its_tables(tmp_path: Path) -> None:
     with file.open("rb") as handle:
         topics = {channel.topic for _, channel, _ in make_reader(handle).iter_messages()}
     assert {"/pull/fx", "/pull/fy", "/wrong", "/events"} < topics
-    theirs = Store.create(tmp_path / "again")
+    theirs = TrialStore.create(tmp_path / "again")
     take(theirs, tmp_path / "out", "c")
     assert_equal(ours, theirs)
     (again,) = theirs.campaign("c").recordings()
@@ -385,7 +385,7 @@ def waited_for(trial: RecordedTrial, name: str, rows: int) -> None:
 
 @pytest.mark.long
 def test_trials_of_two_campaigns_are_not_mixed(
-    labelled: Store, rich: Store, tmp_path: Path
+    labelled: TrialStore, rich: TrialStore, tmp_path: Path
 ) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
@@ -393,13 +393,13 @@ def test_trials_of_two_campaigns_are_not_mixed(
         for where in store.campaigns():
             for one in where.recordings():
                 write_mcap(folder / f"{one.folder.name}.mcap", store, where, one)
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     with pytest.raises(InputError, match=r"--name = all: has another protocol or rig than t\.mcap"):
         take(made, folder, "all")
     assert len(made.campaign("all").committed()) == 4
     commit(campaign(tmp_path / "other", "mine"), "x")
     with pytest.raises(InputError, match="--name = mine: has another protocol or rig"):
-        take(Store.open(tmp_path / "other"), folder, "mine")
+        take(TrialStore.open(tmp_path / "other"), folder, "mine")
 
 
 def _ros_bag(
@@ -452,7 +452,7 @@ def _ros_bag(
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_a_recording_of_ros_2_is_imported(compression: CompressionType, tmp_path: Path) -> None:
     sent = _ros_bag(tmp_path / "bag.mcap", compression=compression)
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     result = take(made, tmp_path / "bag.mcap", "theirs")
     assert (result["events"], result["frames"]) == (5000, 3)
     assert verify(made) == []
@@ -470,7 +470,7 @@ def test_a_recording_of_ros_2_is_imported(compression: CompressionType, tmp_path
 
 def test_other_encodings_and_topics_are_named(tmp_path: Path) -> None:
     _ros_bag(tmp_path / "bag.mcap", encoding="trigger")
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     result = take(made, tmp_path / "bag.mcap", "theirs")
     assert (result["events"], result["frames"]) == (0, 3)
     assert "holds events encoded as 'trigger'; read are mono, " in result["warnings"][0]
@@ -486,7 +486,7 @@ def test_other_encodings_and_topics_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_damage_ends_in_a_message_and_leaves_nothing(rich: Store, tmp_path: Path) -> None:
+def test_damage_ends_in_a_message_and_leaves_nothing(rich: TrialStore, tmp_path: Path) -> None:
     (where,) = rich.campaigns()
     (one,) = where.recordings()
     path = tmp_path / "t.mcap"
@@ -500,7 +500,7 @@ def test_damage_ends_in_a_message_and_leaves_nothing(rich: Store, tmp_path: Path
         data[at] ^= 1 << int(rng.integers(8))
         flips.append(bytes(data))
     refused = 0
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     for data in (*cuts, *flips):
         path.write_bytes(data)
         try:
@@ -533,10 +533,10 @@ def test_a_length_beyond_any_file_is_refused(tmp_path: Path) -> None:
     data[at : at + 9] = struct.pack("<BQ", 0x7F, 2**63)
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"t\.mcap: is damaged or cut short"):
-        take(Store.create(tmp_path / "store"), path, "c")
+        take(TrialStore.create(tmp_path / "store"), path, "c")
 
 
-def _with(where: Store, path: Path, change: Any) -> None:
+def _with(where: TrialStore, path: Path, change: Any) -> None:
     """Write a file of ours whose attachments, metadata and columns were changed on the way."""
     (campaign_,) = where.campaigns()
     (one,) = campaign_.recordings()
@@ -555,7 +555,7 @@ def _with(where: Store, path: Path, change: Any) -> None:
     ],
 )
 def test_columns_that_no_trial_has_are_refused(
-    name: str, change: dict[str, Any], says: str, rich: Store, tmp_path: Path
+    name: str, change: dict[str, Any], says: str, rich: TrialStore, tmp_path: Path
 ) -> None:
     real = ros2.RowsMessage.message
 
@@ -567,7 +567,7 @@ def test_columns_that_no_trial_has_are_refused(
 
     path = tmp_path / "t.mcap"
     _with(rich, path, lambda patch: patch.setattr(ros2.RowsMessage, "message", changed))
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     with pytest.raises(InputError, match=says):
         take(made, path, "c")
     assert not list(made.folder.glob("campaigns/c/trials/*"))
@@ -590,10 +590,10 @@ def test_a_frame_without_a_clock_is_kept(tmp_path: Path) -> None:
     writer.add("frames", replace(late, t_ns=late.t_ns + 7))
     clocks = {"reference": "sync box", "events": {"map": IDENTITY}}
     writer.commit(record("t", clocks=clocks), Provenance())
-    ours = Store.open(tmp_path / "store")
+    ours = TrialStore.open(tmp_path / "store")
     publish(publication(ours), tmp_path / "out", "mcap")
     found = decoded(tmp_path / "out" / "campaigns" / "c" / "t.mcap")
     assert {stamp(one) for _, one, _ in found["/frames"]} == {0}
-    theirs = Store.create(tmp_path / "again")
+    theirs = TrialStore.create(tmp_path / "again")
     take(theirs, tmp_path / "out" / "campaigns" / "c", "c")
     assert_equal(ours, theirs)

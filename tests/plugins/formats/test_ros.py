@@ -22,7 +22,7 @@ from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.formats.recognition import kind_of, skipped_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.formats import ros_files as ros
 from tests.plugins.formats.ros_files import BASE_NS, ROS1, ROS2, SIZE
 from tests.storage.formats.files import taken
@@ -67,7 +67,7 @@ def refused(folder: Path, path: Path) -> str:
     """Import into a new store, which is refused and leaves nothing; return the message."""
     with pytest.raises(InputError) as caught:
         taken(folder, path)
-    assert Store.open(folder).campaigns() == []
+    assert TrialStore.open(folder).campaigns() == []
     return caught.value.message
 
 

@@ -14,7 +14,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.label import ChangePoints, OnsetDoubts, OnsetIntervals, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify_trial
 from tests.plugins.publish.test_croissant import publication
 from tests.storage.trial_files import campaign, commit
@@ -48,14 +48,14 @@ LABELS = {
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> TrialStore:
     where = campaign(tmp_path / "store")
     for number in range(3):
         commit(where, f"t{number}")
-    return Store.open(tmp_path / "store")
+    return TrialStore.open(tmp_path / "store")
 
 
-def labelled(store: Store, trial: str, **stated: object) -> None:
+def labelled(store: TrialStore, trial: str, **stated: object) -> None:
     about = {"incipient_ns": 5, "gross_ns": 9 * MS, "end_ns": 20 * MS, "key": "k", **stated}
     saved = Derived.of(store, "labels", store.campaigns()[0].name)
     saved.write(trial, "k", TrialLabel.model_validate(about))
@@ -67,7 +67,7 @@ def onsets(folder: Path) -> pd.DataFrame:
 
 @pytest.mark.parametrize("name", LABELS)
 def test_the_interval_is_the_labels_own_where_it_has_one(
-    store: Store, tmp_path: Path, name: str
+    store: TrialStore, tmp_path: Path, name: str
 ) -> None:
     stated, expected = LABELS[name]
     labelled(store, "t0", **stated)
@@ -83,7 +83,7 @@ def test_the_interval_is_the_labels_own_where_it_has_one(
             assert (row.low_ns, row.high_ns, row.interval) == (*ends, "label")
 
 
-def test_without_one_it_is_a_frames_period_and_its_clock(store: Store, tmp_path: Path) -> None:
+def test_without_one_it_is_a_frames_period_and_its_clock(store: TrialStore, tmp_path: Path) -> None:
     labelled(store, "t1")
     where = store.campaigns()[0]
     publish(publication(store), tmp_path / "out", "archive")
@@ -95,7 +95,7 @@ def test_without_one_it_is_a_frames_period_and_its_clock(store: Store, tmp_path:
     assert row.interval == "period and clock"
 
 
-def test_an_onset_in_doubt_has_a_reason_and_no_time(store: Store, tmp_path: Path) -> None:
+def test_an_onset_in_doubt_has_a_reason_and_no_time(store: TrialStore, tmp_path: Path) -> None:
     labelled(store, "t2", incipient_ns=None, doubts=OnsetDoubts(incipient="the plate is lost"))
     publish(publication(store), tmp_path / "out", "archive")
     row = onsets(tmp_path / "out").loc[("t2", "incipient")]
@@ -103,7 +103,9 @@ def test_an_onset_in_doubt_has_a_reason_and_no_time(store: Store, tmp_path: Path
     assert row.doubt == "the plate is lost"
 
 
-def test_it_is_a_store_with_one_manifest_that_others_read(store: Store, tmp_path: Path) -> None:
+def test_it_is_a_store_with_one_manifest_that_others_read(
+    store: TrialStore, tmp_path: Path
+) -> None:
     labelled(store, "t0")
     out = tmp_path / "out"
     publish(publication(store), out, "archive")
@@ -113,13 +115,13 @@ def test_it_is_a_store_with_one_manifest_that_others_read(store: Store, tmp_path
     recording = Recording(next((out / "campaigns").glob("*/trials/t0")))
     assert streams[streams.trial == "t0"].stream.tolist() == recording.streams()
     assert (streams.clock_uncertainty_us.dropna() >= 0).all()
-    again = Store.open(out)
+    again = TrialStore.open(out)
     assert not [
         fault for one in again.campaigns()[0].recordings() for fault in verify_trial(one.folder)
     ]
 
 
-def test_without_any_label_it_says_what_to_do(store: Store, tmp_path: Path) -> None:
+def test_without_any_label_it_says_what_to_do(store: TrialStore, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs onsets: run `sliplab label`"):
         publish(publication(store), tmp_path / "out", "archive")
     assert not (tmp_path / "out").exists()

@@ -22,7 +22,7 @@ from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify_trial
 from tests.flows.older import older_store
 from tests.storage.formats.recordings import write_aedat4
@@ -36,7 +36,7 @@ pytestmark = [
 ABOUT = PublicationInfo("Four slides", ("A. Author", "B. Author"), "CC-BY-4.0", "2026-11-24")
 
 
-def publication(store: Store, **changes: Any) -> Publication:
+def publication(store: TrialStore, **changes: Any) -> Publication:
     """All of a store, every trial in the training part."""
     found = tuple(store.campaigns())
     splits = {(item.name, trial): "train" for item in found for trial in item.committed()}
@@ -44,13 +44,13 @@ def publication(store: Store, **changes: Any) -> Publication:
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Four labelled slides, with refitted clocks."""
-    return Store.open(older_store(tmp_path_factory.mktemp("older")))
+    return TrialStore.open(older_store(tmp_path_factory.mktemp("older")))
 
 
 @pytest.fixture(scope="module")
-def published(labelled: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published(labelled: TrialStore, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, published."""
     output = tmp_path_factory.mktemp("out") / "published"
     result = publish(publication(labelled), output, "croissant")
@@ -63,7 +63,7 @@ def _plain(value: object) -> object:
 
 
 def test_croissants_own_reader_finds_no_fault_and_loads_the_tables(
-    labelled: Store, published: Path, caplog: pytest.LogCaptureFixture
+    labelled: TrialStore, published: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING):
         data = mlcroissant.Dataset(published / "croissant.json")  # raises where one is wrong
@@ -107,7 +107,7 @@ def test_rocrates_own_reader_finds_every_file_with_its_checksum(published: Path)
 
 
 def test_files_are_those_of_the_store_and_the_folder_reads_as_one(
-    labelled: Store, published: Path
+    labelled: TrialStore, published: Path
 ) -> None:
     done = subprocess.run(
         ["sha256sum", "--check", "--quiet", "checksums.sha256"],
@@ -118,7 +118,7 @@ def test_files_are_those_of_the_store_and_the_folder_reads_as_one(
         check=False,
     )
     assert (done.returncode, done.stdout) == (0, "")
-    theirs = Store.open(published)
+    theirs = TrialStore.open(published)
     assert catalogue(theirs).equals(catalogue(labelled))
     for where, again in zip(labelled.campaigns(), theirs.campaigns(), strict=True):
         assert again.info == where.info
@@ -137,7 +137,7 @@ def test_files_are_those_of_the_store_and_the_folder_reads_as_one(
 def test_the_card_says_what_the_data_are(published: Path) -> None:
     card = (published / "README.md").read_text()
     assert card.splitlines()[0] == "Simulated data."
-    info = Store.open(published).campaigns()[0].info
+    info = TrialStore.open(published).campaigns()[0].info
     for text in (
         "CC-BY-4.0",
         "A. Author, B. Author (2026): Four slides (simulated data)",
@@ -162,7 +162,9 @@ def test_a_real_campaign_with_a_video_without_labels(tmp_path: Path) -> None:
     about = PublicationInfo("One | trial", (), None, "2026-11-24")
     output = tmp_path / "deep" / "out"
     publish(
-        publication(Store.open(tmp_path / "store"), about=about, splits={}), output, "croissant"
+        publication(TrialStore.open(tmp_path / "store"), about=about, splits={}),
+        output,
+        "croissant",
     )
     data = mlcroissant.Dataset(output / "croissant.json")
     assert {item.uuid for item in data.metadata.record_sets} == {"splits", "trials"}
@@ -174,19 +176,21 @@ def test_a_real_campaign_with_a_video_without_labels(tmp_path: Path) -> None:
     assert card.startswith("# One | trial\n")
     assert "imulated data" not in card
     assert "None was given" in card
-    (other,) = Store.open(output).campaigns()[0].recordings()
+    (other,) = TrialStore.open(output).campaigns()[0].recordings()
     for mine, theirs in zip(
         Recording(where.folder / "trials" / "t").frames(), other.frames(), strict=True
     ):
         assert (mine == theirs).all()
     commit(where, "simulated")
-    mixed = publication(Store.open(tmp_path / "store"))
+    mixed = publication(TrialStore.open(tmp_path / "store"))
     publish(mixed, tmp_path / "mixed", "croissant")
     card = (tmp_path / "mixed" / "README.md").read_text()
     assert card.splitlines()[0] == "Simulated data in part: 1 of 2 trials."
 
 
-def test_nothing_is_left_of_an_interrupted_publication(labelled: Store, tmp_path: Path) -> None:
+def test_nothing_is_left_of_an_interrupted_publication(
+    labelled: TrialStore, tmp_path: Path
+) -> None:
     seen = []
 
     def stop(name: str) -> None:
@@ -201,7 +205,7 @@ def test_nothing_is_left_of_an_interrupted_publication(labelled: Store, tmp_path
 
 def test_what_cannot_be_published_is_said_and_changes_nothing(tmp_path: Path) -> None:
     where = campaign(tmp_path / "store")
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     with pytest.raises(InputError, match=r"campaigns = c: must have a committed trial"):
         publication(store)
     folder = commit(where, "t")
@@ -238,13 +242,13 @@ def test_a_licence_of_ones_own_has_a_name_and_no_address(tmp_path: Path) -> None
     commit(campaign(tmp_path / "store"), "t")
     about = PublicationInfo("T", (), "LicenseRef-Lab", "2026-11-24")
     output = tmp_path / "out"
-    publish(publication(Store.open(tmp_path / "store"), about=about), output, "croissant")
+    publish(publication(TrialStore.open(tmp_path / "store"), about=about), output, "croissant")
     assert json.loads((output / "croissant.json").read_text())["license"] == "LicenseRef-Lab"
     assert ROCrate(output).root_dataset["license"].id == "#LicenseRef-Lab"
 
 
 def test_a_published_store_says_which_trials_are_not_whole(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     for name in ("a", "b"):
         path = tmp_path / f"{name}.aedat4"
         write_aedat4(path)

@@ -18,7 +18,7 @@ from sliplab.storage.schema.label import LABELS
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import PROVENANCE
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.flows.older import older_store
 from tests.plugins.publish.test_croissant import publication
@@ -26,24 +26,24 @@ from tests.storage.trial_files import campaign, commit
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Four labelled slides, with refitted clocks."""
-    return Store.open(older_store(tmp_path_factory.mktemp("older")))
+    return TrialStore.open(older_store(tmp_path_factory.mktemp("older")))
 
 
 def take(folder: Path, path: Path, name: str = "again") -> Json:
     kind = kind_of(path)
     assert kind == "croissant"
-    return import_trials(Store.create(folder), name, trials_in(path, kind), path, kind)
+    return import_trials(TrialStore.create(folder), name, trials_in(path, kind), path, kind)
 
 
 @pytest.mark.parametrize("form", ["croissant", pytest.param("lerobot", marks=pytest.mark.long)])
-def test_every_file_comes_back_to_the_bit(form: str, labelled: Store, tmp_path: Path) -> None:
+def test_every_file_comes_back_to_the_bit(form: str, labelled: TrialStore, tmp_path: Path) -> None:
     output = tmp_path / "out"
     publish(publication(labelled), output, form)
     (where,) = labelled.campaigns()
     taken = take(tmp_path / "store", output, where.name)
-    theirs = Store.open(tmp_path / "store")
+    theirs = TrialStore.open(tmp_path / "store")
     assert (len(taken["imported"]), verify(theirs)) == (4, [])
     again = theirs.campaign(where.name)
     for name in ("campaign.json", "protocol.yaml", "rig.yaml"):
@@ -122,19 +122,19 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
 def test_a_damaged_publication_leaves_nothing(fault: str, tmp_path: Path) -> None:
     where = campaign(tmp_path / "ours")
     commit(where, "a")
-    publish(publication(Store.open(tmp_path / "ours")), tmp_path / "out", "croissant")
+    publish(publication(TrialStore.open(tmp_path / "ours")), tmp_path / "out", "croissant")
     damage, text = FAULTS[fault]
     damage(tmp_path / "out")
     with pytest.raises(DamagedFile, match=text):
         take(tmp_path / "store", tmp_path / "out")
-    assert verify(Store.open(tmp_path / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "store")) == []
     assert not list((tmp_path / "store").rglob("a*"))
 
 
 def test_one_campaign_is_imported_at_a_time(tmp_path: Path) -> None:
     for name in ("c", "d"):
         commit(campaign(tmp_path / "ours", name), "a", campaign=name)
-    ours = Store.open(tmp_path / "ours")
+    ours = TrialStore.open(tmp_path / "ours")
     publish(publication(ours), tmp_path / "out", "croissant")
     with pytest.raises(InputError, match=r"must be of one campaign; .*campaigns/c, .*campaigns/d"):
         take(tmp_path / "store", tmp_path / "out")

@@ -24,7 +24,7 @@ from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import PoseChunk, WrenchChunk
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.publish.test_croissant import publication
 from tests.storage.trial_files import FRAME, IDENTITY, campaign, events, frames, record
 
@@ -64,12 +64,12 @@ def _trial(where: Any, name: str, shift: int = 0) -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Two trials, the second one labelled."""
     where = campaign(tmp_path_factory.mktemp("lerobot") / "store")
     _trial(where, "a")
     _trial(where, "b", shift=1)
-    made = Store.open(where.folder.parents[1])
+    made = TrialStore.open(where.folder.parents[1])
     label = TrialLabel(
         key="k", incipient_ns=START_NS + 25_000_000, gross_ns=START_NS + 60_000_000, end_ns=0
     )
@@ -78,7 +78,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 @pytest.fixture(scope="module")
-def published(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published(store: TrialStore, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, published; the second trial is in the training part, the first one in the test."""
     output = tmp_path_factory.mktemp("out") / "set"
     seen: list[str] = []
@@ -105,7 +105,7 @@ def _frames(published: Path, episode: int) -> list[Any]:
     return [frame.to_ndarray(format="gray") for frame in found]
 
 
-def test_every_row_is_what_the_store_has(store: Store, published: Path) -> None:
+def test_every_row_is_what_the_store_has(store: TrialStore, published: Path) -> None:
     for number, name in enumerate(("b", "a")):
         rows = pq.read_table(published / f"data/chunk-000/file-{number:03d}.parquet")
         trial = store.campaign("c").recording(name)
@@ -189,8 +189,8 @@ def test_meta_says_what_the_files_hold(published: Path) -> None:
     assert stats["observation.images.events"]["count"] == [total]
 
 
-def test_the_raw_trials_are_beside_the_rows(store: Store, published: Path) -> None:
-    theirs = Store.open(published).campaign("c")
+def test_the_raw_trials_are_beside_the_rows(store: TrialStore, published: Path) -> None:
+    theirs = TrialStore.open(published).campaign("c")
     for one in store.campaign("c").recordings():
         assert theirs.recording(one.folder.name).raw_checksum == one.raw_checksum
     card = (published / "README.md").read_text()
@@ -216,5 +216,5 @@ def test_a_trial_without_a_time_of_its_own_is_refused(tmp_path: Path) -> None:
         record("t", counts=counts, clocks={}, quality={"passed": False}), Provenance()
     )
     with pytest.raises(InputError, match="neither events nor poses"):
-        publish(publication(Store.open(tmp_path / "store")), tmp_path / "out", "lerobot")
+        publish(publication(TrialStore.open(tmp_path / "store")), tmp_path / "out", "lerobot")
     assert [path.name for path in tmp_path.iterdir()] == ["store"]

@@ -23,7 +23,7 @@ import numpy as np
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import lsl
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 HERE = Path(__file__).parent
 JUMPS_S = (0.05, 0.3, 2.0)
@@ -103,7 +103,7 @@ def recordings(folder: Path, count: int, seed: int, drift_ppm: float = 100.0) ->
                 if number % 2:
                     sender.jump(chance.choice((-1, 1)) * chance.choice(JUMPS_S))
                     time.sleep(0.5 + 1.5 * chance.random())
-    store = Store.open(folder / "store")
+    store = TrialStore.open(folder / "store")
     return [_outcome(each, chance) for each in store.campaign("lsl").recordings()]
 
 

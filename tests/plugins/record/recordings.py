@@ -16,7 +16,7 @@ from sliplab.plugins.record.recorder import RecordedTrial, record
 from sliplab.plugins.record.sources import Source, push
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 
 SIZE = 64, 48
 NAME = "killed"
@@ -78,7 +78,7 @@ def forked(work: Callable[[], None]) -> Iterator[int]:
 
 def campaign_of(folder: Path) -> Campaign:
     """The campaign of a folder's store."""
-    return Store.open(folder).campaign(NAME)
+    return TrialStore.open(folder).campaign(NAME)
 
 
 def check_rows(recording: Recording) -> None:

@@ -19,7 +19,7 @@ from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import Source, columns
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ROWS = 60
 
@@ -52,7 +52,7 @@ def recorded(folder: Path, source: Source, send: Callable[[int], object]) -> Rec
             while trial.rows()[source.name] < ROWS and time.monotonic() < deadline:
                 assert not trial.faults
                 time.sleep(0.01)
-    return Store.open(folder).campaign("rows").recording(trial.id)
+    return TrialStore.open(folder).campaign("rows").recording(trial.id)
 
 
 def test_lines_of_a_serial_port_are_timed_by_arrival_and_wrong_ones_counted(tmp_path: Path) -> None:

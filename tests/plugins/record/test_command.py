@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 
 
@@ -61,7 +61,7 @@ def test_for_and_every_make_trials_of_their_length(tmp_path: Path, streams: Path
         "faults": [],
         "warnings": [],
     }
-    for recording in Store.open(store).campaign("rows").recordings():
+    for recording in TrialStore.open(store).campaign("rows").recordings():
         assert recording.record.condition == {"object": "mug", "grip": "2.0 N"}
         last = recording.record.trial == "000003"  # which begins late on a busy machine
         assert 0.5 * (not last) <= recording.record.recorded_s < 1.5
@@ -114,7 +114,7 @@ def test_keys_start_mark_and_stop_and_ctrl_c_keeps_the_trial(tmp_path: Path, str
         child.kill()
         child.wait()
         os.close(screen)
-    first, second = Store.open(store).campaign("keys").recordings()
+    first, second = TrialStore.open(store).campaign("keys").recordings()
     assert [mark.name for mark in first.record.imported.marks] == ["slip"]
     assert first.record.imported.given.uncertainty_ns == 5e8
     assert second.record.streams["gauge"].rows > 0

@@ -12,7 +12,7 @@ from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.salvage import killed, salvage_campaign
 from sliplab.storage.trials.prefix_journal import read_journal
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.record.recordings import (
     NAME,
     campaign_of,
@@ -104,7 +104,7 @@ def test_the_next_recording_keeps_the_unfinished_one_and_goes_on(tmp_path: Path)
         with recorder.trial() as trial:
             feed(trial, 0)
     assert trial.id not in recorder.salvaged
-    assert Store.open(tmp_path).campaign(NAME).committed() >= {trial.id, *recorder.salvaged}
+    assert TrialStore.open(tmp_path).campaign(NAME).committed() >= {trial.id, *recorder.salvaged}
 
 
 def wait_for_states(folder: Path, count: int) -> None:

@@ -18,7 +18,7 @@ import pytest
 from sliplab.flows.verify import verify
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import Source, columns, push
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 
 MS = 1_000_000
@@ -92,7 +92,7 @@ def test_no_row_vanishes_without_a_word(tmp_path: Path, fall: str) -> None:
                 send(trial, FALLS[fall](time.monotonic_ns(), k), k)
     found = verify(str(tmp_path))
     assert found["ok"]
-    (recording,) = Store.open(tmp_path).campaign("rows").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("rows").recordings()
     dropped = recording.record.imported.dropped
     rows = {name: about.rows for name, about in recording.record.streams.items()}
     rows["events"] = recording.record.counts.events

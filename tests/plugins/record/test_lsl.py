@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.plugins.record.lsl import JumpRemover, LslSettings, Reading
+from sliplab.plugins.record.lsl import ClockReading, JumpRemover, LslSettings
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import lsl
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.record.lsl_clocks import available, recordings
 
 pylsl = pytest.importorskip("pylsl")
@@ -50,7 +50,7 @@ def test_jumps_are_taken_out_at_the_sample_where_they_happened(jump_ns: int) -> 
     found, before = [], None
     for at in range(0, 20_000_000_001, 2_000_000_000):
         device = at + at // 10_000 + (jump_ns if at > 7_005_000_000 else 0)
-        reading = Reading(device, at - device + int(rng.integers(-50_000, 50_000)), 100_000)
+        reading = ClockReading(device, at - device + int(rng.integers(-50_000, 50_000)), 100_000)
         jump = remover.reading(reading)
         part = (true_ns >= at - 2_000_000_000) & (true_ns < at)
         found.append(remover.times(stamp_ns[part], host_ns[part], before, jump))
@@ -78,7 +78,7 @@ def test_stamps_that_fall_back_widen_the_bound_and_what_are_none_are_counted(
                 fake._outlet.push_sample(np.array([float(k)]), np.nan if k == 5 else t_s)
     finally:
         fake.close()
-    (found,) = Store.open(tmp_path).campaign("lsl").recordings()
+    (found,) = TrialStore.open(tmp_path).campaign("lsl").recordings()
     rows, about = found.record.streams["g"].rows, found.record.imported
     assert rows + about.dropped["rows of g that were lost"] == sent
     assert about.dropped["rows of g that were lost"] == 1

@@ -15,7 +15,7 @@ from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import F64, I64
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 APART_NS, DRIFT = 77_000_000_000, 100e-6
 """What the clock of the DAQ is behind the host's at the first pulse, and gains."""
@@ -78,7 +78,7 @@ def recorded(folder: Path, how: str, seeds: tuple[int, int], stated_ms: float | 
                 sent[k] = end
             trial.push("glove", int(first + now + now * DRIFT - APART_NS), 1.0)
         trial.mark("first", first)
-    (recording,) = Store.open(folder).campaign("pulses").recordings()
+    (recording,) = TrialStore.open(folder).campaign("pulses").recordings()
     return recording
 
 
@@ -159,7 +159,7 @@ def test_rows_that_come_later_than_their_delay_are_refused_by_pulses(
                 t_ns = first + own[0][sent:end] - APART_NS * (name != "box")
                 trial.push(name, t_ns, own[1][sent:end])
             sent = end
-    (recording,) = Store.open(tmp_path).campaign("late").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("late").recordings()
     found = recording.clocks
     if late_ms:
         assert "they put it" in found.refused["daq"]

@@ -15,7 +15,7 @@ from sliplab.plugins.record.recorder import RecordedTrial, levels, record
 from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.record.recordings import SIZE, check_rows, feed, sources
 
 
@@ -251,7 +251,7 @@ def test_values_are_those_of_the_moment_they_were_pushed(tmp_path: Path) -> None
         for step in range(20):
             t_ns[:], values[:] = time.monotonic_ns(), step
             recording.sources[0].device.push(t_ns, values, values)
-    (found,) = Store.open(tmp_path).campaign("same").recordings()
+    (found,) = TrialStore.open(tmp_path).campaign("same").recordings()
     np.testing.assert_array_equal(found.samples("pull")["fx"], np.repeat(np.arange(20.0), 10))
 
 
@@ -285,7 +285,7 @@ def test_wrong_marks_are_refused(tmp_path: Path, wrong: Any) -> None:
         pytest.raises(InputError, match="^mark.*" + next(iter(wrong)).replace("name", "text")),
     ):
         trial.mark(**{"name": "slip", **wrong})
-    (found,) = Store.open(tmp_path).campaign("marks").recordings()
+    (found,) = TrialStore.open(tmp_path).campaign("marks").recordings()
     assert not found.record.imported.marks
 
 

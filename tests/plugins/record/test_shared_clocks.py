@@ -15,7 +15,7 @@ from sliplab.plugins.record.shared_clock import now_ns
 from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import validate
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.patching import loose
 
 STATED_MS = 2.0
@@ -40,7 +40,7 @@ def test_times_of_a_shared_clock_lie_within_what_is_stated(
             error_ns = round(chance.uniform(-STATED_MS, STATED_MS) * 1e6)
             with recorder.trial() as trial:
                 true.append(pushed(trial, clock, error_ns))
-    recordings = list(Store.open(tmp_path).campaign("shared").recordings())
+    recordings = list(TrialStore.open(tmp_path).campaign("shared").recordings())
     held = 0
     for (stamp_ns, true_ns), recording in zip(true, recordings, strict=True):
         found = recording.clocks.streams["glove"]
@@ -55,7 +55,7 @@ def test_stamps_that_their_arrival_contradicts_are_refused(tmp_path: Path, error
     source = push("glove", {"pull": "N"}, clock="utc", uncertainty_ms=STATED_MS)
     with record([source], tmp_path, "shared") as recorder, recorder.trial() as trial:
         pushed(trial, "utc", round(error_s * 1e9))
-    (recording,) = Store.open(tmp_path).campaign("shared").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("shared").recordings()
     assert "glove" not in recording.clocks.streams
     whys = {37.0: "as TAI is", -37.0: "s behind UTC"}
     assert whys.get(error_s, "no clock that drifts") in recording.clocks.refused["glove"]

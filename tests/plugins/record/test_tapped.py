@@ -14,7 +14,7 @@ from sliplab.plugins.record.sources import push
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 pytestmark = pytest.mark.realtime  # a process that waits for a core pushes too late to be bounded
 
@@ -50,7 +50,7 @@ def recorded(
                 time.sleep(0.001)  # the sensors measure in real time
             trial.push("glove", t_ns[part] - APART_NS, glove[part], np.zeros(part.size))
             trial.push("pull", t_ns[part], force[part])
-    (recording,) = Store.open(folder).campaign("taps").recordings()
+    (recording,) = TrialStore.open(folder).campaign("taps").recordings()
     return recording
 
 

@@ -11,7 +11,7 @@ import pytest
 from sliplab.plugins.record import shared_clock
 from sliplab.plugins.record.recorder import record
 from sliplab.plugins.record.sources import push
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 S = 1_000_000_000
 AHEAD_S = {"TAI": 37, "UTC": 0, "GPS time": 18, "no scale": 3600}
@@ -44,7 +44,7 @@ def test_only_stamps_of_the_declared_scale_are_believed(
             threading.Event().wait(0.01)  # the sensor's period
             for name, (_, scale) in cases.items():
                 trial.push(name, time.time_ns() + AHEAD_S[scale] * S, 1.0)
-    (recording,) = Store.open(tmp_path / "s").campaign("scales").recordings()
+    (recording,) = TrialStore.open(tmp_path / "s").campaign("scales").recordings()
     clocks, about = recording.clocks, recording.record.imported
     for name, (clock, scale) in cases.items():
         declared = DECLARED[clock]

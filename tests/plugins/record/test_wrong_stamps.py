@@ -20,7 +20,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import I64
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 STEPS, STEP_S, STATED_MS = 40, 0.01, 2.0
 S = 1_000_000_000
@@ -104,7 +104,7 @@ def test_rows_keep_the_stamps_they_came_with_and_wrong_clocks_are_refused(
     with record(streams, tmp_path, "stamps") as recorder, recorder.trial() as trial:
         taken = pushed(trial.push, clock)
     assert verify(str(tmp_path))["ok"]
-    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("stamps").recordings()
     clocks, about = recording.clocks, recording.record.imported
     there = {name for name, stamps in taken.items() if stamps}
     for name in there:
@@ -158,7 +158,7 @@ def test_lines_with_wrong_stamps_of_a_shared_clock(tmp_path: Path, wrong: str) -
             line = f"{TEXTS[wrong](time.time_ns(), k)},{k}\n"
             sender.sendto(line.encode(), ("127.0.0.1", port))
     assert verify(str(tmp_path))["ok"]
-    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("stamps").recordings()
     counts = recording.record.devices["g"]["counts"]
     malformed = {"nan_once": 1, "infinite_once": 1, "ns_for_s": STEPS}.get(wrong, 0)
     assert counts == {"received": STEPS - malformed, "malformed": malformed}
@@ -184,7 +184,7 @@ def test_events_that_fall_back_are_counted_and_wrong_clocks_refused(
             t_ns = STAMPS[wrong](now_ns("ptp"), first, k)
             trial.push("events", t_ns // 1000, 1, 2, 1)
     assert verify(str(tmp_path))["ok"]
-    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("stamps").recordings()
     about = recording.record.imported
     lost = sum((about.dropped or {}).values())
     assert recording.record.counts.events + lost == STEPS
@@ -218,7 +218,7 @@ def test_host_stamps_of_cameras_are_held_against_their_arrival(tmp_path: Path) -
                 "events", STAMPS[names["events"]](time.monotonic_ns(), first, k) // 1000, 1, 2, 1
             )
     assert verify(str(tmp_path))["ok"]
-    (recording,) = Store.open(tmp_path).campaign("stamps").recordings()
+    (recording,) = TrialStore.open(tmp_path).campaign("stamps").recordings()
     right = {"right", "pushed_late", "e_right", "e_pushed_late"}
     found = {name for name in recording.clocks.streams if not name.endswith("_clock")}
     assert found == right

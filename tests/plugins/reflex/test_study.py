@@ -24,7 +24,7 @@ from sliplab.plugins.reflex.rows import reflex_rows
 from sliplab.plugins.reflex.study import STUDY
 from sliplab.protocols import InputError
 from sliplab.protocols.detection import Detection
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -163,7 +163,7 @@ def test_a_detector_of_the_bench_is_set_by_the_store_and_reacts(
     assert [it.detector for it in asked.cases] == [None, "network", "rate"]
     assert len({it.key for it in asked.cases}) == 3
     fitted = asked.requests["rate"].source.detector()
-    validation = scenes(StoreLabels(Store(place)), collected(Store(place)), "validation")
+    validation = scenes(StoreLabels(TrialStore(place)), collected(TrialStore(place)), "validation")
     for one in validation:  # as many as are allowed, none of so few, are false early
         found = feed(make_detector("rate"), one)
         early = found.t_us < one.slip.paper_us - 30_000

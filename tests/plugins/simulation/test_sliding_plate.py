@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.holds import run
 from sliplab.plugins.simulation.devices import MockDevices, build_mock
-from sliplab.protocols import Plan, Trial
+from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from tests.conftest import ROOT
@@ -61,7 +61,7 @@ QUARTER_MM = 0.025
 HEAVY = {"gravity": "mass=0.245kg", "disturbance": "disturbance=100", "pilot_gravity": "0.245kg"}
 
 
-def hold_still(plan: Plan, trial: Trial) -> dict[str, Any]:
+def hold_still(plan: Plan, trial: PlannedTrial) -> dict[str, Any]:
     """Run a trial on the simulated rig, as a campaign's first attempt, and check its hold."""
     truth = run(load_rig_file(ROOT / "rigs" / "rehearsal.yaml")[0], plan, trial)
     held = truth["from_hold"]

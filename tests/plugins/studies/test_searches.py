@@ -19,7 +19,7 @@ from sliplab.plugins.studies.generalise.run import measure_generalisation
 from sliplab.plugins.studies.generalise.section import RESULT as GENERALISATION
 from sliplab.plugins.studies.section import RESULT
 from sliplab.protocols.errors import InputError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 pytestmark = pytest.mark.programs
 
@@ -77,7 +77,7 @@ def test_each_is_done_once_and_reported(
         "detector search": 2,
         "report": 1,
     }
-    store = Store.open(run_requests[0].store)
+    store = TrialStore.open(run_requests[0].store)
     for result in (GENERALISATION, RESULT):
         assert result.read(store) is not None
     page = (run_requests[0].store / "report" / "index.html").read_text()

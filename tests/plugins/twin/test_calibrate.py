@@ -38,7 +38,7 @@ from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 TRIALS = 12
 EFFECTS = {check.key: 100.0 for check in CHECKS}
@@ -46,13 +46,13 @@ EFFECTS = {check.key: 100.0 for check in CHECKS}
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Some slides of the pilot, labelled."""
     folder = tmp_path_factory.mktemp("twin") / "store"
     rig = folder.with_name("rig.yaml")
     rig.write_text("extends: rehearsal\nname: full\nmock: {scene: {level: L3}}\n")
     sliplab.collect("pilot", rig=rig, store=folder, trials=TRIALS).label()
-    return Store(folder)
+    return TrialStore(folder)
 
 
 def requested(tmp_path: Path, **changes: Any) -> calibrate.FitRequest:
@@ -60,7 +60,7 @@ def requested(tmp_path: Path, **changes: Any) -> calibrate.FitRequest:
     return calibrate.request(Path("rehearsal"), tmp_path / "twin.yaml", **wanted)
 
 
-def fitted(store: Store, item: Collected, wanted: calibrate.FitRequest) -> TwinFit:
+def fitted(store: TrialStore, item: Collected, wanted: calibrate.FitRequest) -> TwinFit:
     """Fit a twin, and write all its files."""
     fit, trials = calibrate.calibrate_scene(store, item, wanted)
     STUDY.write(finding(wanted.out, fit, trials))
@@ -107,7 +107,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibrate, "PREDICTED", 2)
 
 
-def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) -> None:
+def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: TrialStore) -> None:
     (item,) = collected(store, None)
     trial, recording = item.trials[0]
     slide = slide_of(item.plan.program(trial))
@@ -131,7 +131,7 @@ def test_a_recorded_slide_and_a_simulated_one_are_the_same_arrays(store: Store) 
 
 @pytest.mark.long
 def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
-    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (item,) = collected(store, None)
     wanted = requested(tmp_path)
@@ -186,7 +186,7 @@ def test_a_pilot_that_is_the_rigs_own_gives_the_rigs_own_values(
 
 @pytest.mark.long
 def test_no_interval_where_a_misfit_touches_its_parameter(
-    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (item,) = collected(store, None)
     wanted = requested(tmp_path, seed=3)  # the store keeps the worlds of other tests' seeds
@@ -223,7 +223,7 @@ def test_no_interval_where_a_misfit_touches_its_parameter(
 
 @pytest.mark.long
 def test_what_is_not_told_keeps_the_rigs_value(
-    store: Store, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (item,) = collected(store, None)
     wanted = requested(tmp_path, seed=2)  # the store keeps the worlds of other tests' seed
@@ -245,7 +245,7 @@ def test_what_is_not_told_keeps_the_rigs_value(
     assert "a force sensor" in (tmp_path / "twin.html").read_text()
 
 
-def test_noise_of_tracking_is_the_pilots_own(store: Store) -> None:
+def test_noise_of_tracking_is_the_pilots_own(store: TrialStore) -> None:
     (item,) = collected(store, None)
     pilot = read_pilot(store, item)
     own, _ = load_rig_file(Path("rehearsal"))
@@ -256,7 +256,7 @@ def test_noise_of_tracking_is_the_pilots_own(store: Store) -> None:
 
 
 def test_a_misfit_ends_with_exit_code_1(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = MisfitCheck(
         title="light that flickers",
@@ -308,7 +308,7 @@ def test_a_misfit_ends_with_exit_code_1(
 
 @pytest.mark.long
 def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
-    store: Store, tmp_path: Path
+    store: TrialStore, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="must be a simulated rig with driver: mock"):
         calibrate.request(Path("ur5"), tmp_path / "twin.yaml", 100, 0.5, 1)
@@ -358,7 +358,7 @@ def test_a_hidden_rig_is_found(tmp_path: Path) -> None:
         "  event_camera: {noise_hz: 0.013, readout_hz: 4500}\n"
     )
     sliplab.collect("pilot", rig=hidden, store=tmp_path / "store").label()
-    store = Store(tmp_path / "store")
+    store = TrialStore(tmp_path / "store")
     (item,) = collected(store, None)
     fit = fitted(store, item, requested(tmp_path))
     found = {it.key: it for it in fit.parameters}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.contact_estimates import (
     NOT_LOGGED,
-    Papillae,
+    PapillaEstimates,
     contact_estimates,
     papillae,
     read_contact,
@@ -51,7 +51,7 @@ def estimates(trials: Sequence[PilotTrial]) -> dict[str, float]:
     return contact_estimates(contact)
 
 
-def each_papilla(trials: Sequence[PilotTrial]) -> Papillae | None:
+def each_papilla(trials: Sequence[PilotTrial]) -> PapillaEstimates | None:
     contact = read_contact(trials)
     assert contact is not None
     return papillae(contact)

@@ -24,7 +24,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import ReviewedOnsets
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.analysis.labels import reviewable
 from tests.analysis.labels.reviewable import EVENTS, FRAMES, NAME, Reviewable, events, frame_times
 from tests.flows.listening import listening
@@ -251,5 +251,5 @@ def test_a_recording_without_a_protocol_is_shown(tmp_path: Path) -> None:
             trial.push("events", None, n, 1, 1)
             trial.push("pull", None, float(n))
     path = tmp_path / "v.rrd"
-    view.save(view.find(Store.open(tmp_path / "s"), trial.id), path)
+    view.save(view.find(TrialStore.open(tmp_path / "s"), trial.id), path)
     assert Read(path).curve("/streams/pull")[1] == [0.0, 1.0, 2.0, 3.0, 4.0]

@@ -32,7 +32,8 @@ from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
-from sliplab.rigs.rig_file import RigFile, RigLimits, load_rig_file
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_limits import RigLimits
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, NullSink, PoseChunk, WrenchChunk
 from tests.conftest import ROOT
 from tests.patching import loose, put

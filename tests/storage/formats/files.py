@@ -13,14 +13,14 @@ from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.streams import EventChunk, Json
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 
 SMALL = (6, 8)
 """Rows and columns of a camera of few pixels."""
 
 
-def take(store: Store, path: Path, kind: str = "", *, salvage: bool = False) -> Json:
+def take(store: TrialStore, path: Path, kind: str = "", *, salvage: bool = False) -> Json:
     """Import as the campaign `theirs`; the store is whole then."""
     kind = kind or kind_of(path)
     found = trials_in(path, kind, salvage=salvage)
@@ -33,7 +33,7 @@ def taken(
     folder: Path, path: Path, kind: str = "", *, salvage: bool = False
 ) -> tuple[Json, list[Recording]]:
     """Import into a new store; return the result and what is there."""
-    store = Store.create(folder)
+    store = TrialStore.create(folder)
     return take(store, path, kind, salvage=salvage), list(store.campaign("theirs").recordings())
 
 

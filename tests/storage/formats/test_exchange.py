@@ -31,23 +31,23 @@ from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue, write_table
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.storage.formats.files import SMALL, lab_hdf5, lab_pickles, take
 from tests.storage.trial_files import campaign, commit
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Two trials of a thousand events and twelve frames, and one without frames."""
     folder = tmp_path_factory.mktemp("exchange") / "store"
     where = campaign(folder)
     for trial in ("depth=2.4mm,r=1", "depth=2.4mm,r=2"):
         commit(where, trial)
-    return Store.open(folder)
+    return TrialStore.open(folder)
 
 
-def _import(folder: Path, path: Path, kind: str = "") -> Store:
-    made = Store.create(folder)
+def _import(folder: Path, path: Path, kind: str = "") -> TrialStore:
+    made = TrialStore.create(folder)
     take(made, path, kind)
     return made
 
@@ -63,7 +63,7 @@ def _same(one: EventChunk, other: EventChunk) -> None:
 
 
 @pytest.mark.parametrize("kind", ["aedat4", "dsec"])
-def test_a_campaign_goes_out_and_comes_back(store: Store, tmp_path: Path, kind: str) -> None:
+def test_a_campaign_goes_out_and_comes_back(store: TrialStore, tmp_path: Path, kind: str) -> None:
     ours = store.campaign("c")
     result = export_trials(list(ours.recordings()), tmp_path / "out", kind, "c")
     assert (result["trials"], result["events"], result["triggers"]) == (2, 2000, 20)
@@ -291,7 +291,7 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
         tmp_path / "a.aedat4", {0: Aedat4Stream("EVTS", "e", (346, 300), "x")}
     ) as file:
         file.events(0, whole)
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     path = tmp_path / "a.aedat4"
     result = import_trials(made, "theirs", trials_in(path, "aedat4"), path, "aedat4")
     (text,) = result["warnings"]
@@ -358,7 +358,7 @@ def test_columns_of_different_lengths_are_refused(tmp_path: Path) -> None:
         _import(tmp_path / "store", tmp_path / "a.h5")
 
 
-def test_labels_and_catalogue_as_tables(store: Store, tmp_path: Path) -> None:
+def test_labels_and_catalogue_as_tables(store: TrialStore, tmp_path: Path) -> None:
     table = catalogue(store)
     for name in ("t.csv", "t.parquet"):
         write_table(table, tmp_path / name)
@@ -477,7 +477,7 @@ BAD: dict[str, Callable[[Path], Path]] = {
 @pytest.mark.usefixtures("small")
 def test_damaged_and_hostile_files_leave_nothing(tmp_path: Path, name: str) -> None:
     path = BAD[name](tmp_path)
-    made = Store.create(tmp_path / "store")
+    made = TrialStore.create(tmp_path / "store")
     with pytest.raises(InputError) as caught:
         _import(tmp_path / "store", path)
     assert path.name in caught.value.message
@@ -487,7 +487,7 @@ def test_damaged_and_hostile_files_leave_nothing(tmp_path: Path, name: str) -> N
 
 
 @pytest.mark.parametrize("file", ["../t.h5", "/etc/passwd", "t\0.h5", "", "gone.h5", "link.h5"])
-def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> None:
+def test_a_manifest_leads_nowhere(tmp_path: Path, store: TrialStore, file: str) -> None:
     out = tmp_path / "out"
     export_trials([store.campaign("c").recording("depth=2.4mm,r=1")], out, "dsec", "c")
     (tmp_path / "t.h5").write_bytes((out / "depth=2.4mm,r=1.h5").read_bytes())
@@ -497,16 +497,16 @@ def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> No
     (out / EXPORT_MANIFEST).write_text(json.dumps(reported))
     with pytest.raises(InputError):
         _import(tmp_path / "store", out, "dsec")
-    assert Store.open(tmp_path / "store").campaigns() == []
+    assert TrialStore.open(tmp_path / "store").campaigns() == []
 
 
 def test_names_become_plain() -> None:
     assert name_of("../../etc/passwd") == "etc_passwd"
     for name in ("../x", "a/b", "\0", "..", "-x", "a" * 500, "\u202e", "a..b"):
-        Store(Path("s")).campaign(name_of(name))
+        TrialStore(Path("s")).campaign(name_of(name))
 
 
-def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> None:
+def test_a_collected_campaign_is_left_alone(store: TrialStore, tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "a.h5")
     path, kind = tmp_path / "a.h5", "lab-hdf5"
     with pytest.raises(InputError, match="is a collected campaign"):

@@ -31,7 +31,7 @@ from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, sha256
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.plugins.adapters.adapters import SLIDES, bring, slides
@@ -186,7 +186,7 @@ def test_a_trial_committed_before_a_signal_stays(tmp_path: Path, monkeypatch: An
         raise KeyboardInterrupt
 
     monkeypatch.setattr(import_module, "_take", interrupted)
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     with pytest.raises(KeyboardInterrupt):
         take(store, tmp_path / "a.h5")
     assert store.campaign("theirs").committed() == {"a"}
@@ -246,7 +246,7 @@ def test_one_event_before_the_clock_costs_neither_file_nor_folder(tmp_path: Path
     for number, times in enumerate(([10, 12], [-7, 10, 12], [10, 12])):
         cells = lab_cells(SMALL, {(3, 5): times})
         (folder / f"d3_s0.5_dir_up_r{number}_events_on").write_bytes(pickle.dumps(cells))
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     result = take(store, folder)
     assert [len(one.events()) for one in store.campaign("theirs").recordings()] == [2, 2, 2]
     (item,) = result["left_out"]
@@ -320,7 +320,7 @@ def test_damaged_and_empty_files_of_a_folder_leave_the_others(tmp_path: Path) ->
     assert all(f"/{item['file']}: " in item["reason"] for item in result["failed"])
     assert "not imported: g: " in done.stderr
     assert "--salvage imports 500 events" in done.stderr
-    assert verify(Store.open(tmp_path / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "store")) == []
     again = _line(tmp_path, tmp_path / "theirs")
     assert again.returncode == 1
     assert "not imported: b: " in again.stderr
@@ -338,7 +338,7 @@ def _faulty_lerobot(folder: Path, number: int) -> None:
 def test_one_bad_episode_leaves_the_others(tmp_path: Path, number: int) -> None:
     foreign(tmp_path / "set")
     _faulty_lerobot(tmp_path / "set", number)
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     result = take(store, tmp_path / "set")
     assert result["imported"] == [f"episode-{1 - number:06d}"]
     (failed,) = result["failed"]
@@ -463,7 +463,7 @@ def test_single_precision_unix_times_fail_their_gates(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "the times of events have steps of 1.28e+08 us" in done.stderr
     assert "all 50 events have one time" in done.stderr
-    store = Store.open(tmp_path / "store")
+    store = TrialStore.open(tmp_path / "store")
     (found,) = store.campaign("theirs").recordings()
     assert not found.record.quality.passed
     assert set(found.record.quality.gates) == {"events_time_resolution_us", "events_times"}
@@ -553,7 +553,7 @@ def test_names_in_any_script_stay_apart_and_are_in_the_record(tmp_path: Path) ->
     stems += ["e\u0301", "\u00e9", "TRIAL", "trial", "a b", "a:b"]
     for stem in stems:
         _dsec(folder / f"{stem}.h5", np.arange(COUNT))
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     result = take(store, folder)
     names = result["imported"]
     assert len({name.casefold() for name in names}) == len(stems)

@@ -20,7 +20,7 @@ from sliplab.storage.formats.recognition import kind_of, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials import hdf5_reader
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.storage.formats.recordings import COUNT, FILES, SIZE, all_events
 
 MOST = 256
@@ -132,7 +132,7 @@ def test_counts_are_spread_in_parts(tmp_path: Path) -> None:
 def test_exports_read_in_parts(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write = FILES["aedat4"][1]
     write(tmp_path / "a.aedat4")
-    store = Store(tmp_path / "store")
+    store = TrialStore(tmp_path / "store")
     import_trials(store, "set", trials_in(tmp_path / "a.aedat4", "aedat4"), tmp_path, "aedat4")
     recording: Recording = store.campaign("set").recording("a")
 

@@ -19,7 +19,7 @@ from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST
 from sliplab.storage.formats.recognition import MIXED, kind_of, skipped_in
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5, taken
 
@@ -222,7 +222,7 @@ def test_a_bad_file_is_named_with_what_would_be_right(
     with pytest.raises(InputError, match=says) as caught:
         taken(tmp_path / "store", tmp_path / file)
     assert caught.value.message.count(file) == 1
-    assert Store.open(tmp_path / "store").campaigns() == []
+    assert TrialStore.open(tmp_path / "store").campaigns() == []
 
 
 def test_a_bad_file_of_faerys(tmp_path: Path) -> None:
@@ -291,7 +291,7 @@ def test_two_formats_of_one_name_are_left_out_and_the_rest_is_imported(tmp_path:
     done = here("import", folder, "--store", tmp_path / "store", "--name", "theirs")
     assert done.returncode == 1
     assert "holds 2 files for the trial b: b.aedat4, b.h5; " in " ".join(done.stderr.split())
-    campaign = Store.open(tmp_path / "store").campaign("theirs")
+    campaign = TrialStore.open(tmp_path / "store").campaign("theirs")
     assert [one.trial_id for one in campaign.recordings()] == ["a"]
     assert [one.trial_id for one in taken(tmp_path / "s", folder, "aedat4")[1]] == ["a", "b"]
 
@@ -303,7 +303,7 @@ def test_two_files_of_one_name_and_nothing_else_are_refused(tmp_path: Path) -> N
     lab_hdf5(folder / "b.h5")
     with pytest.raises(InputError, match=r"2 files for the trial b: b\.aedat4, b\.h5; .*KIND"):
         taken(tmp_path / "store", folder)
-    assert Store.open(tmp_path / "store").campaigns() == []
+    assert TrialStore.open(tmp_path / "store").campaigns() == []
 
 
 def test_a_missing_library_is_said_before_anything_is_written(
@@ -317,7 +317,7 @@ def test_a_missing_library_is_said_before_anything_is_written(
     _es(folder / "c.es")
     with pytest.raises(InputError, match=r"c\.es: .*pip install 'sliplab\[formats\]'"):
         taken(tmp_path / "store", folder)
-    assert Store.open(tmp_path / "store").campaigns() == []
+    assert TrialStore.open(tmp_path / "store").campaigns() == []
     (folder / "c.es").unlink()
     assert [one.trial_id for one in taken(tmp_path / "other", folder)[1]] == ["a", "b"]
 

@@ -21,7 +21,7 @@ from sliplab.storage.formats.recognition import trials_in
 from sliplab.storage.schema.trial import Lost
 from sliplab.storage.trials.catalogue import UNREAD, catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.storage.formats.files import taken
 from tests.storage.formats.recordings import (
     CHECKED,
@@ -62,7 +62,7 @@ def _import(folder: Path, path: Path, *, salvage: bool) -> Outcome:
 def _check_refused(folder: Path, path: Path, message: str) -> None:
     assert path.name in message
     assert [item.name for item in folder.rglob("*") if item.is_file()] == ["store.json"]
-    assert Store.open(folder).campaigns() == []
+    assert TrialStore.open(folder).campaigns() == []
 
 
 def _is_prefix(found: Recording) -> int:
@@ -270,7 +270,7 @@ def test_a_salvaged_trial_is_never_called_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.aedat4"
     write_aedat4(path)
     path.write_bytes(path.read_bytes()[:-10])
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     found = trials_in(path, "aedat4", salvage=True)
     result = import_trials(store, "theirs", found, path, "aedat4", salvage=True)
     (lost,) = result["salvaged"]
@@ -296,7 +296,7 @@ def test_a_published_trial_that_is_cut_short_is_not_taken_for_a_recording(tmp_pa
     where = campaign(tmp_path / "ours")
     commit(where, "t")
     path = tmp_path / "t.mcap"
-    write_mcap(path, Store.open(tmp_path / "ours"), where, where.recording("t"))
+    write_mcap(path, TrialStore.open(tmp_path / "ours"), where, where.recording("t"))
     path.write_bytes(path.read_bytes()[:-2000])
     outcome = _import(tmp_path / "store", path, salvage=True)
     assert isinstance(outcome.error, DamagedFile)

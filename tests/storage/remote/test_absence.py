@@ -14,7 +14,7 @@ from sliplab.storage.remote.pull import PULLED, origin_of, pull
 from sliplab.storage.remote.push import push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.control import again
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import DAMAGED, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
@@ -44,12 +44,12 @@ def remote(lab: Campaign, tmp_path: Path) -> Remote:
 @pytest.fixture
 def back(lab: Campaign, tmp_path: Path) -> Campaign:
     """The campaign in the second lab's store."""
-    return Store.open(tmp_path / "back").campaign("c")
+    return TrialStore.open(tmp_path / "back").campaign("c")
 
 
-def store_of(where: Campaign) -> Store:
+def store_of(where: Campaign) -> TrialStore:
     """The store of a campaign."""
-    return Store.open(where.folder.parents[1])
+    return TrialStore.open(where.folder.parents[1])
 
 
 def test_pull_leaves_trials_that_were_not_pulled(remote: Remote, back: Campaign) -> None:
@@ -279,7 +279,7 @@ def test_mirror_of_older_version_follows(
 
 
 def test_pull_that_was_killed_at_once_follows_later(remote: Remote, tmp_path: Path) -> None:
-    Store.create(tmp_path / "killed")
+    TrialStore.create(tmp_path / "killed")
     assert pull(remote, tmp_path / "killed").pulled == 3
     assert origin_of(tmp_path / "killed") == remote.url
 
@@ -345,8 +345,8 @@ def test_pull_interrupted_in_a_description_is_no_damage_and_follows_later(
     place = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         pull(remote, place, on_bytes=interrupt)
-    assert [item for item in verify(Store.open(place)) if item.kind == DAMAGED] == []
+    assert [item for item in verify(TrialStore.open(place)) if item.kind == DAMAGED] == []
     assert pull(remote, place).problems == []
     again(lab, [TRIALS[0]], BY)
     push(store_of(lab), remote)
-    assert (pull(remote, place).withdrawn, verify(Store.open(place))) == (1, [])
+    assert (pull(remote, place).withdrawn, verify(TrialStore.open(place))) == (1, [])

@@ -36,7 +36,7 @@ from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, DATA, Checksum
 from sliplab.storage.trials.control import again
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.remote.remotes import new_bucket, s3_server, tree
 from tests.storage.trial_files import campaign, commit
@@ -63,9 +63,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def store(made: Path, tmp_path: Path) -> Store:
+def store(made: Path, tmp_path: Path) -> TrialStore:
     """A copy of it."""
-    return Store.open(Path(shutil.copytree(made, tmp_path / "store")))
+    return TrialStore.open(Path(shutil.copytree(made, tmp_path / "store")))
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def remote(tmp_path: Path) -> Remote:
     return Remote(f"file://{tmp_path}/shared")
 
 
-def the(store: Store) -> Campaign:
+def the(store: TrialStore) -> Campaign:
     """Its campaign."""
     return store.campaign("c")
 
@@ -82,7 +82,7 @@ def the(store: Store) -> Campaign:
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("kind", ["s3", "file", "memory"])
 def test_what_is_pulled_is_what_was_pushed(
-    kind: str, endpoint: str, store: Store, tmp_path: Path
+    kind: str, endpoint: str, store: TrialStore, tmp_path: Path
 ) -> None:
     url = {
         "s3": lambda: new_bucket(endpoint),
@@ -98,12 +98,12 @@ def test_what_is_pulled_is_what_was_pushed(
     back = pull(Remote(url), tmp_path / "back", quarantine=True)
     assert (back.trials, back.pulled, back.set_aside, back.problems) == (2, 2, 1, [])
     assert tree(tmp_path / "back", "campaigns") == tree(store.folder, "campaigns")
-    assert verify(Store.open(tmp_path / "back")) == []
+    assert verify(TrialStore.open(tmp_path / "back")) == []
     assert pull(Remote(url), tmp_path / "back", quarantine=True).files == 0
 
 
 def test_cut_anywhere_nothing_half_is_visible(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The storage fails at its n-th write, for every n, and the next push goes on from there."""
     put, whole = Remote.put, 0
@@ -144,7 +144,7 @@ def _objects(remote: Remote) -> list[dict[str, int]]:
 
 
 def test_a_pull_that_was_cut_goes_on(
-    store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push(store, remote)
     get, count = Remote.get, itertools.count(1)
@@ -158,14 +158,14 @@ def test_a_pull_that_was_cut_goes_on(
         patch.setattr(Remote, "get", failing)
         with pytest.raises(KeyboardInterrupt):
             pull(remote, tmp_path / "back")
-    back = Store.open(tmp_path / "back")
+    back = TrialStore.open(tmp_path / "back")
     assert the(back).committed() == {TRIALS[0]}
     assert pull(remote, tmp_path / "back").files == 3 * 5 - 7
     assert tree(back.folder, "campaigns") == tree(store.folder, "campaigns")
 
 
 def test_files_of_a_trial_come_side_by_side_and_one_fault_stops_the_others(
-    store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push(store, remote)
     get, together = Remote.get, Barrier(2)
@@ -193,7 +193,9 @@ def test_files_of_a_trial_come_side_by_side_and_one_fault_stops_the_others(
     assert tree(tmp_path / "back", "campaigns") == tree(store.folder, "campaigns")
 
 
-def test_a_damaged_object_is_named_and_sent_anew(store: Store, remote: Any, tmp_path: Path) -> None:
+def test_a_damaged_object_is_named_and_sent_anew(
+    store: TrialStore, remote: Any, tmp_path: Path
+) -> None:
     push(store, remote)
     manifest = trial_manifest(the(store), TRIALS[1])
     objects = tmp_path / "shared" / objects_folder("c")
@@ -216,7 +218,7 @@ def test_a_damaged_object_is_named_and_sent_anew(store: Store, remote: Any, tmp_
     assert pull(remote, tmp_path / "back").problems == []
 
 
-def test_a_damaged_trial_is_not_pushed(store: Store, remote: Remote) -> None:
+def test_a_damaged_trial_is_not_pushed(store: TrialStore, remote: Remote) -> None:
     path = the(store).folder / "trials" / TRIALS[0] / "record.json"
     path.write_bytes(path.read_bytes().replace(b"left", b"rite"))
     done = push(store, remote)
@@ -226,7 +228,7 @@ def test_a_damaged_trial_is_not_pushed(store: Store, remote: Remote) -> None:
 
 
 def test_a_trial_that_is_wanted_again_goes_and_comes_back(
-    store: Store, remote: Remote, tmp_path: Path
+    store: TrialStore, remote: Remote, tmp_path: Path
 ) -> None:
     push(store, remote)
     pull(remote, tmp_path / "back")
@@ -244,18 +246,18 @@ def test_a_trial_that_is_wanted_again_goes_and_comes_back(
     assert push(store, remote).replaced == 1
     assert pull(remote, tmp_path / "back").replaced == 1
     assert tree(tmp_path / "back/campaigns/c", "trials") == tree(the(store).folder, "trials")
-    aside = the(Store.open(tmp_path / "back")).quarantined()
+    aside = the(TrialStore.open(tmp_path / "back")).quarantined()
     assert {item["cause"].split(":")[0] for item in aside} == {"withdrawn", "replaced"}
 
 
-def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> None:
+def test_two_stores_do_not_mix(store: TrialStore, remote: Remote, tmp_path: Path) -> None:
     push(store, remote)
     other = campaign(tmp_path / "other")
     commit(other, TRIALS[0], recorded_s=2.0)
-    done = push(Store.open(tmp_path / "other"), remote)
+    done = push(TrialStore.open(tmp_path / "other"), remote)
     assert "an attempt pushed from another store is there" in done.problems[0]
     other.update({"name": "c", "simulated": False}, "protocol: 1\n", "rig: 1\n")
-    done = push(Store.open(tmp_path / "other"), remote)
+    done = push(TrialStore.open(tmp_path / "other"), remote)
     assert "another campaign of this name is there: it differs in simulated" in done.problems[0]
     assert verify_remote(remote) == (3, [])
     # nor is anything in a store changed that was not pulled from there
@@ -271,7 +273,7 @@ def test_two_stores_do_not_mix(store: Store, remote: Remote, tmp_path: Path) -> 
         push(store, Remote(f"file://{tmp_path}/elsewhere"))
 
 
-def test_pushed_while_trials_are_taken(store: Store, remote: Remote, tmp_path: Path) -> None:
+def test_pushed_while_trials_are_taken(store: TrialStore, remote: Remote, tmp_path: Path) -> None:
     """A trial that stands aside is not seen; one that is committed meanwhile is sent next time."""
     begun = the(store).begin("depth=4mm,r=1", (48, 32), 100)
     new = iter(["depth=5mm,r=1"])
@@ -295,7 +297,7 @@ ESCAPES = ["../x", "/etc/x", "a/b", "..", ".hidden", "bench/../../x", "x\0", "",
 
 @pytest.mark.parametrize("name", ESCAPES)
 def test_a_manifest_leads_nowhere_else(
-    name: str, store: Store, remote: Remote, tmp_path: Path
+    name: str, store: TrialStore, remote: Remote, tmp_path: Path
 ) -> None:
     push(store, remote)
     for kind, trial in (("trials", TRIALS[0]), ("about", "")):
@@ -312,7 +314,9 @@ def test_a_manifest_leads_nowhere_else(
     assert not list((tmp_path / "back").rglob("x*"))
 
 
-def test_names_and_objects_of_others_are_refused(store: Store, remote: Any, tmp_path: Path) -> None:
+def test_names_and_objects_of_others_are_refused(
+    store: TrialStore, remote: Any, tmp_path: Path
+) -> None:
     push(store, remote)
     trials = tmp_path / "shared/campaigns/c/trials"
     shutil.copy(trials / f"{TRIALS[0]}.json", trials / "other=1mm.json")  # of something else
@@ -352,7 +356,7 @@ def test_a_mutated_manifest_is_refused(data: st.DataObject) -> None:
 
 
 def test_a_mirror_fetches_what_is_read(
-    store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
     push(store, remote)
@@ -387,7 +391,9 @@ def test_a_mirror_fetches_what_is_read(
     assert not (the(again_there).folder / "trials" / TRIALS[2] / "data.h5").exists()
 
 
-def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_path: Path) -> None:
+def test_versions_and_places_that_cannot_be_used(
+    store: TrialStore, remote: Any, tmp_path: Path
+) -> None:
     with pytest.raises(RemoteMissing, match="does not contain a pushed store"):
         pull(remote, tmp_path / "back")
     assert not (tmp_path / "back").exists()
@@ -416,7 +422,7 @@ def test_versions_and_places_that_cannot_be_used(store: Store, remote: Any, tmp_
 
 
 @pytest.mark.long
-def test_secrets_are_nowhere(endpoint: str, store: Store, tmp_path: Path) -> None:
+def test_secrets_are_nowhere(endpoint: str, store: TrialStore, tmp_path: Path) -> None:
     url = new_bucket(endpoint)
     push(store, Remote(url))
     pull(Remote(url), tmp_path / "back")

@@ -11,12 +11,12 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.flows.older import older_store
 
 
 def test_a_label_of_an_older_version_is_written_as_it_was_read(tmp_path: Path) -> None:
-    store = Store.open(older_store(tmp_path / "store"))
+    store = TrialStore.open(older_store(tmp_path / "store"))
     labels = Derived.of(store, LABELS, "small")
     paths = sorted(labels.folder.glob("*.json"))
     assert len(paths) == 4
@@ -45,7 +45,7 @@ def test_keys_that_older_versions_did_not_write_have_defaults() -> None:
     ],
 )
 def test_a_damaged_label_names_file_key_and_value(tmp_path: Path, change: Any, said: str) -> None:
-    store = Store.open(older_store(tmp_path / "store"))
+    store = TrialStore.open(older_store(tmp_path / "store"))
     labels = Derived.of(store, LABELS, "small")
     path = min(labels.folder.glob("*.json"))
     write_json(path, {**read_json(path), **change})

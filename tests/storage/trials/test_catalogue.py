@@ -22,7 +22,7 @@ from sliplab.storage.trials.catalogue import (
     write_table,
 )
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.command_line import here
 from tests.storage.trial_files import IDENTITY, campaign, commit
 
@@ -54,8 +54,8 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def _store(where: Campaign) -> Store:
-    return Store.open(where.folder.parent.parent)
+def _store(where: Campaign) -> TrialStore:
+    return TrialStore.open(where.folder.parent.parent)
 
 
 def _both(where: Campaign) -> tuple[pd.DataFrame, list[str]]:
@@ -181,7 +181,7 @@ def test_conditions_become_columns_with_units(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     commit(where, "a", condition={"depth": "2.4 mm", "speed": "0.6 mm/s", "side": "left"})
     commit(where, "b", condition={"depth": "3.4 mm", "speed": "1.6 mm/s", "side": "right"})
-    table = catalogue(Store.open(tmp_path / "s"))
+    table = catalogue(TrialStore.open(tmp_path / "s"))
     assert list(table["trial"]) == ["a", "b"]
     assert list(query(table, "depth_mm > 3 and side == 'right'")["speed_mm_per_s"]) == [1.6]
     assert list(query(table, "events == 1000")["trial"]) == ["a", "b"]
@@ -194,7 +194,7 @@ def test_expressions_that_are_no_query_are_refused(expression: str, tmp_path: Pa
     where = campaign(tmp_path / "s")
     commit(where, "a")
     with pytest.raises(ValueError, match=r"may contain only columns|cannot be read"):
-        query(catalogue(Store.open(tmp_path / "s")), expression)
+        query(catalogue(TrialStore.open(tmp_path / "s")), expression)
 
 
 def test_one_equals_sign_gets_a_hint() -> None:
@@ -240,11 +240,11 @@ def test_table_is_written_into_a_folder_that_is_missing(suffix: str, tmp_path: P
 
 def test_an_empty_store_has_an_empty_catalogue(tmp_path: Path) -> None:
     campaign(tmp_path / "s")
-    assert len(catalogue(Store.open(tmp_path / "s"))) == 0
+    assert len(catalogue(TrialStore.open(tmp_path / "s"))) == 0
 
 
 def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
-    folder = Store.create(tmp_path / "s").folder
+    folder = TrialStore.create(tmp_path / "s").folder
     for name in ("store.json", "campaigns/new.csv", "campaigns/c/trials/a/trial.json"):
         with pytest.raises(InputError, match="belongs to the store"):
             check_table_path(folder / name)
@@ -252,4 +252,4 @@ def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
     check_table_path(tmp_path / "mine.csv")
     assert here("schema", "trial", "--out", folder / "store.json").returncode == 2
     assert here("trials", folder, "--output", folder / "store.json").returncode == 2
-    Store.open(folder)
+    TrialStore.open(folder)

@@ -13,13 +13,13 @@ from sliplab.storage import process
 from sliplab.storage.files import read_json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import SKIPPED, again, skip, skipped
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import commit, fail
 
 
 def test_requests_keep_who_when_why_and_their_order(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     assert control.requests(store) == []
     assert control.paused(store) is None
     first = control.ask(store, "pause", who="anna", why="lunch")
@@ -35,7 +35,7 @@ def test_requests_keep_who_when_why_and_their_order(tmp_path: Path) -> None:
 
 
 def test_two_who_ask_at_once_are_both_heard(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(lambda n: control.ask(store, "skip", why=str(n)), range(40)))
     assert sorted(item.number for item in made) == list(range(1, 41))
@@ -43,7 +43,7 @@ def test_two_who_ask_at_once_are_both_heard(tmp_path: Path) -> None:
 
 
 def test_what_is_no_request_is_passed_over(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     made = control.ask(store, "pause")
     folder = store.folder / control.FOLDER
     for name, text in (
@@ -72,7 +72,7 @@ def test_a_committed_trial_that_is_wanted_again_is_kept_aside(where: Any, tmp_pa
     assert (where.attempts(), where.failed_attempts()) == ({"t": 1}, {})
     assert again(where, ["t"], BY) == {"t": "was pending already"}
     commit(where, "t")
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_failed_attempts_are_forgiven_once_and_stay(where: Campaign) -> None:

@@ -12,7 +12,7 @@ from sliplab.storage.files import read_json, sweep_temporary, write_bytes
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, quarantine_damaged, verify
 from tests.protocols.planning import rows
 from tests.storage.trial_files import campaign, commit, fill, record
@@ -90,7 +90,7 @@ def test_verify_names_it_and_what_is_whole_stays_readable(
     where = campaign(tmp_path / "s")
     whole = [commit(where, name) for name in ("t", "whole")][1]
     damage(where.folder, *change.split(" ", 2))
-    store = Store.open(tmp_path / "s")
+    store = TrialStore.open(tmp_path / "s")
     problems = verify(store)
     kinds = {"damaged": DAMAGED, "unfinished": UNFINISHED}
     said = [f"{item.path}: {item.what}" for item in problems if item.kind == kinds[kind]]
@@ -112,7 +112,7 @@ def test_what_is_damaged_is_never_read(where: Campaign, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"does not match its checksum.*verify .* --quarantine"):
         recording.events()
     unreadable: list[str] = []
-    assert list(catalogue(Store.open(tmp_path / "s"), unreadable)["trial"]) == ["t", "whole"]
+    assert list(catalogue(TrialStore.open(tmp_path / "s"), unreadable)["trial"]) == ["t", "whole"]
     assert len(unreadable) == 1
 
 
@@ -125,7 +125,7 @@ def test_what_is_partial_is_no_trial_and_is_quarantined_with_its_cause(tmp_path:
     assert where.committed() == {"whole"}
     assert [recording.trial_id for recording in where.recordings()] == ["whole"]
     unreadable: list[str] = []
-    assert len(catalogue(Store.open(tmp_path / "s"), unreadable)) == 1
+    assert len(catalogue(TrialStore.open(tmp_path / "s"), unreadable)) == 1
     assert len(unreadable) == 3
     assert where.sweep() == 3
     causes = {item["trial"]: item["cause"] for item in where.quarantined()}
@@ -134,7 +134,7 @@ def test_what_is_partial_is_no_trial_and_is_quarantined_with_its_cause(tmp_path:
     assert causes["lost"].endswith("record.json: is missing")
     assert "checksums.json: cannot be read" in causes["empty"]
     assert where.failed_attempts() == {}
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
     commit(where, "short")
 
 
@@ -148,7 +148,7 @@ def test_a_partial_trial_gives_way_to_the_one_that_is_taken(where: Campaign) -> 
 def test_damaged_trials_are_set_aside_when_asked(where: Campaign, tmp_path: Path) -> None:
     _flip(commit(where, "t") / "data.h5")
     commit(where, "whole")
-    store = Store.open(tmp_path / "s")
+    store = TrialStore.open(tmp_path / "s")
     assert quarantine_damaged(store, verify(store)) == ["t"]
     assert where.committed() == {"whole"}
     assert where.quarantined()[0]["cause"] == "damaged: data.h5: does not match its checksum"

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 
 def test_a_result_is_stale_by_inputs_parameters_and_version(tmp_path: Path) -> None:
-    results = Derived.of(Store.create(tmp_path), "labels", "c")
+    results = Derived.of(TrialStore.create(tmp_path), "labels", "c")
     key = make_key("labels", 1, ["a"], {"threshold": 2})
     assert not results.fresh("t", key)
     results.write("t", key, {"onset": 5}, {"x": np.arange(3)})
@@ -26,7 +26,7 @@ def test_a_result_is_stale_by_inputs_parameters_and_version(tmp_path: Path) -> N
 
 
 def test_a_damaged_result_is_stale(tmp_path: Path) -> None:
-    results = Derived.of(Store.create(tmp_path), "labels", "c")
+    results = Derived.of(TrialStore.create(tmp_path), "labels", "c")
     results.write("t", "k", {})
     (results.folder / "t.json").write_text("{")
     assert not results.fresh("t", "k")

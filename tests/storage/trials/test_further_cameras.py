@@ -20,7 +20,7 @@ from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import ClockReads, PulseChunk, ScalarChunk, WrenchChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from sliplab.storage.trials.writer import TrialWriter
 from tests.storage.trial_files import (
@@ -100,7 +100,7 @@ def test_everything_comes_back_by_its_name(spool: bool, tmp_path: Path) -> None:
     # the first cameras are what they were
     assert len(recording.events()) == 1000
     assert len(list(recording.frames())) == 12
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_the_public_interface_reads_them(tmp_path: Path) -> None:
@@ -178,7 +178,9 @@ def test_verify_finds_what_was_spoilt(how: str, problem: tuple[str, str], tmp_pa
         (folder / "stream-back.mkv").unlink()
     else:
         shutil.copy(side, folder / "stream-other.h5")
-    assert [(Path(p.path).name, p.what) for p in verify(Store.open(tmp_path / "s"))] == [problem]
+    assert [(Path(p.path).name, p.what) for p in verify(TrialStore.open(tmp_path / "s"))] == [
+        problem
+    ]
     found = Recording(folder)
     if how == "bytes":
         with pytest.raises(StoreError, match="is damaged"):
@@ -210,7 +212,7 @@ def test_verify_holds_files_and_record_against_each_other(
         if change is not None:
             data["streams"][name] = {**known, **change}
     writer.commit(TrialRecord.model_validate(data), Provenance())
-    assert any(problem in found.what for found in verify(Store.open(tmp_path / "s")))
+    assert any(problem in found.what for found in verify(TrialStore.open(tmp_path / "s")))
 
 
 def test_a_killed_trial_goes_to_quarantine_with_its_streams(where: Any, tmp_path: Path) -> None:
@@ -224,14 +226,14 @@ def test_a_killed_trial_goes_to_quarantine_with_its_streams(where: Any, tmp_path
     assert {"stream-side.h5", "stream-back.h5", "stream-back.mkv"} <= {
         path.name for path in aside.iterdir()
     }
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_they_are_pushed_and_fetched_when_read(tmp_path: Path, monkeypatch: Any) -> None:
     folder = taken(tmp_path)
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     url = f"file://{tmp_path / 'bucket'}"
-    push(Store.open(tmp_path / "s"), Remote(url))
+    push(TrialStore.open(tmp_path / "s"), Remote(url))
     mirrored, _ = open_mirror(url)
     (recording,) = mirrored.campaign("c").recordings()
     assert not (recording.folder / "stream-side.h5").exists()

@@ -20,7 +20,7 @@ from sliplab.storage.trials.checksums import read_sums
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.protocols.planning import put_all
 from tests.storage.trial_files import campaign, commit
@@ -44,9 +44,9 @@ def _with(folder: Path, data: bytes) -> Recording:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> TrialStore:
     """A store without anything."""
-    return Store.create(tmp_path / "store")
+    return TrialStore.create(tmp_path / "store")
 
 
 # what is put in a record's place (nothing: dropped)
@@ -75,7 +75,7 @@ def test_a_record_of_another_shape_is_damage(made: Campaign, change: str) -> Non
     put_all(data, change)
     with pytest.raises(StoreError, match=r"record\.json"):
         _ = _with(folder, json.dumps(data).encode()).record
-    store, unreadable = Store.open(made.folder.parents[1]), []  # type: ignore[var-annotated]
+    store, unreadable = TrialStore.open(made.folder.parents[1]), []  # type: ignore[var-annotated]
     assert len(catalogue(store, unreadable)) == 0
     assert len(unreadable) == 1
     assert [p.trial for p in verify(store)] == ["t"]
@@ -143,7 +143,7 @@ NAMES += ["x" * 252, "x" * 300, "a/../../b", "a\\..\\b/"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_stay_in_the_store(store: Store, name: str) -> None:
+def test_names_stay_in_the_store(store: TrialStore, name: str) -> None:
     for use in (
         lambda: store.campaign(name),
         lambda: store.campaign("c").recording(name),
@@ -156,15 +156,15 @@ def test_names_stay_in_the_store(store: Store, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["campaigns", "control", "derived", "models", "report", "before"])
-def test_a_link_out_of_the_store_is_refused(store: Store, tmp_path: Path, name: str) -> None:
+def test_a_link_out_of_the_store_is_refused(store: TrialStore, tmp_path: Path, name: str) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "inside").mkdir()
     os.symlink(tmp_path / "outside", store.folder / name)
     with pytest.raises(StoreError, match="points out of the store"):
-        Store.open(store.folder)
+        TrialStore.open(store.folder)
     (store.folder / name).unlink()
     os.symlink("inside", store.folder / name)
-    Store.open(store.folder)
+    TrialStore.open(store.folder)
 
 
 def test_a_quarantine_that_leads_out_is_refused(tmp_path: Path) -> None:
@@ -183,13 +183,13 @@ def test_names_of_trials_and_campaigns_cannot_lead_out_of_the_store(tmp_path: Pa
     for name in ("../x", "a/b", "", ".hidden", "a\0b", "x" * 300):
         with pytest.raises(StoreError, match="cannot be the name"):
             where.begin(name, None, 100)
-    store = Store.open(tmp_path / "s")
+    store = TrialStore.open(tmp_path / "s")
     for name in ("..", "../x", "/etc", "a/../../b", "a\\..\\b/", "", ".", "é"):
         with pytest.raises(StoreError, match="cannot be the name"):
             store.campaign(name)
 
 
-def test_derived_results_that_lead_out_are_refused(store: Store, tmp_path: Path) -> None:
+def test_derived_results_that_lead_out_are_refused(store: TrialStore, tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (store.folder / "derived").mkdir()
     os.symlink(tmp_path / "outside", store.folder / "derived" / "labels")
@@ -201,7 +201,7 @@ def test_derived_results_that_lead_out_are_refused(store: Store, tmp_path: Path)
     "change", [{"campaign": "../../x"}, {"trials": ["../x"]}, {"trials": 1}, {"kind": "delete"}]
 )
 def test_a_request_that_leads_out_is_left_out(tmp_path: Path, change: dict[str, Any]) -> None:
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     control.ask(store, "again", campaign="c", trials=("t",))
     path = store.folder / "control" / "000001.json"
     path.write_text(json.dumps({**read_json(path), **change}))
@@ -209,7 +209,7 @@ def test_a_request_that_leads_out_is_left_out(tmp_path: Path, change: dict[str, 
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", '{"did": 1}', "{", '{"did": {"a": NaN}}'])
-def test_a_damaged_answer_is_an_empty_one(store: Store, text: str) -> None:
+def test_a_damaged_answer_is_an_empty_one(store: TrialStore, text: str) -> None:
     asked = control.ask(store, "pause")
     (store.folder / "control" / "000001.done.json").write_text(text)
     assert control.answered(store, asked) == {"did": {}}

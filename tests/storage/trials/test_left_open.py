@@ -22,7 +22,7 @@ from sliplab.storage.remote.pull import pull
 from sliplab.storage.remote.push import push
 from sliplab.storage.trials import superblock
 from sliplab.storage.trials.hdf5_writer import blank
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import quarantine_damaged, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit, fail
@@ -62,8 +62,8 @@ def data_of(where: Campaign) -> Path:
     return where.folder / "trials" / "t" / "data.h5"
 
 
-def store_of(where: Campaign) -> Store:
-    return Store.open(where.folder.parents[1])
+def store_of(where: Campaign) -> TrialStore:
+    return TrialStore.open(where.folder.parents[1])
 
 
 def leave_open(path: Path, mode: str = "r+", how: str = "") -> bytes:

@@ -20,7 +20,7 @@ from sliplab.storage import process
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import lock
 from sliplab.storage.trials.lock import STORE_LOCK, Locked, NoLocks, exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.storage.holders import holder_of
@@ -134,7 +134,7 @@ def test_locks_that_other_machines_do_not_see(
 
 
 def test_a_store_on_such_a_share_says_whose_it_is(tmp_path: Path, monkeypatch: Any) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     monkeypatch.setattr(lock, "_alone", lambda _: "fuse.sshfs")
     (store.folder / STORE_LOCK).write_text(json.dumps({"pid": 12, "host": "nas", "boot": "b"}))
     done = here("migrate", store.folder)

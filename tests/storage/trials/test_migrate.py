@@ -10,22 +10,22 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials import migrate as module
 from sliplab.storage.trials.checksums import write_sums
 from sliplab.storage.trials.migrate import STEPS, migrate, retained
-from sliplab.storage.trials.store import FORMAT, Store, StoreError
+from sliplab.storage.trials.store import FORMAT, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import campaign, commit
 
 
-def old(folder: Path) -> Store:
+def old(folder: Path) -> TrialStore:
     """A store as version 1 left it."""
     where = campaign(folder)
     commit(where, "t")
     (where.folder / "checksums.json").unlink()
     write_json(folder / "store.json", {"format": 1})
-    return Store.open(folder)
+    return TrialStore.open(folder)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> TrialStore:
     """A store as version 1 left it."""
     return old(tmp_path / "s")
 
@@ -34,14 +34,14 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_an_older_store_is_read_as_it_is(store: Store, tmp_path: Path) -> None:
+def test_an_older_store_is_read_as_it_is(store: TrialStore, tmp_path: Path) -> None:
     before = files(tmp_path)
     assert verify(store) == []
     assert len(store.campaign("c").recording("t").events()) == 1000
     assert files(tmp_path) == before
 
 
-def test_it_migrates_forward_with_a_copy_kept(store: Store) -> None:
+def test_it_migrates_forward_with_a_copy_kept(store: TrialStore) -> None:
     before = files(store.folder)
     assert migrate(store) == list(range(1, FORMAT))
     assert store.format == FORMAT
@@ -83,7 +83,7 @@ def test_an_interrupted_migration_is_begun_again(
     assert all(data == before[name] for name, data in files(retained(store, 1)).items())
 
 
-def test_formats_follow_each_other(store: Store) -> None:
+def test_formats_follow_each_other(store: TrialStore) -> None:
     seen: list[int] = []
     steps = {n: lambda _, n=n: seen.append(n) for n in (1, 2, 3)}
     assert migrate(store, steps) == [1, 2, 3]
@@ -92,20 +92,20 @@ def test_formats_follow_each_other(store: Store) -> None:
     assert set(STEPS) == set(range(1, FORMAT))
 
 
-def test_a_newer_store_is_refused_by_name(store: Store) -> None:
+def test_a_newer_store_is_refused_by_name(store: TrialStore) -> None:
     write_json(store.folder / "store.json", {"format": FORMAT + 1})
     with pytest.raises(StoreError, match=r"written by a newer version .* update it"):
-        Store.open(store.folder)
+        TrialStore.open(store.folder)
     for wrong in (0, "2", None, True, 1.5):
         write_json(store.folder / "store.json", {"format": wrong})
         with pytest.raises(StoreError, match="must be a number"):
-            Store.open(store.folder)
+            TrialStore.open(store.folder)
     (store.folder / "store.json").write_text("{")
     with pytest.raises(StoreError, match="restore it from a copy"):
-        Store.open(store.folder)
+        TrialStore.open(store.folder)
 
 
-def test_a_newer_trial_is_refused_by_name(store: Store) -> None:
+def test_a_newer_trial_is_refused_by_name(store: TrialStore) -> None:
     campaign_ = store.campaign("c")
     commit(campaign_, "n", format=99)
     with pytest.raises(StoreError, match=r"record.json: format = 99: was written by a newer"):
@@ -121,7 +121,7 @@ def test_a_newer_trial_is_refused_by_name(store: Store) -> None:
         campaign_.recording("m").open()
 
 
-def test_a_migration_names_what_it_cannot_bring_forward(store: Store) -> None:
+def test_a_migration_names_what_it_cannot_bring_forward(store: TrialStore) -> None:
     (store.campaign("c").folder / "rig.yaml").unlink()
     with pytest.raises(StoreError, match=r"rig.yaml: is missing: restore it .* nothing was"):
         migrate(store)

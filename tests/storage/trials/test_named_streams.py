@@ -13,7 +13,7 @@ from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import NullSink, WrenchChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from sliplab.storage.trials.writer import TrialWriter
 from tests.storage.trial_files import FRAME, campaign, fill, record
@@ -68,7 +68,7 @@ def test_they_come_back_however_they_were_chunked(pieces: int, tmp_path: Path) -
             ("t", "host", "force", "torque"), COUNT
         )
         assert len(reader.wrenches("none")) == 0
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
     with h5py.File(folder / "data.h5") as file:
         group = file["streams/force"]
         assert group.attrs["kind"] == b"wrench"
@@ -139,7 +139,7 @@ def test_verify_holds_file_and_record_against_each_other(
     fill(writer)
     writer.add("force", ALL[:rows])
     writer.commit(record("t", **({"streams": streams} if streams else {})), Provenance())
-    assert any(problem in found.what for found in verify(Store.open(tmp_path / "s")))
+    assert any(problem in found.what for found in verify(TrialStore.open(tmp_path / "s")))
 
 
 def test_verify_sees_a_clock_that_runs_backwards(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_verify_sees_a_clock_that_runs_backwards(tmp_path: Path) -> None:
     writer.add("force", ALL[:2])
     writer.add("force", ALL[:1])
     writer.commit(record("t", streams=said(force=3)), Provenance())
-    found = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
+    found = [problem.what for problem in verify(TrialStore.open(tmp_path / "s"))]
     assert found == ["streams/force/t runs backwards"]
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.recovery import recover
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import FRAME, campaign, commit, fail, fill, record
 
@@ -45,12 +45,12 @@ def test_killed_commit_is_completed(where: Campaign, tmp_path: Path, how: str) -
     damage(folder := killed(where), how)
     for path in folder.iterdir():
         path.chmod(0o644)  # as it is until all are written
-    (problem,) = verify(Store.open(tmp_path / "s"))
+    (problem,) = verify(TrialStore.open(tmp_path / "s"))
     assert problem.kind == "unfinished"
     assert problem.path.endswith("incoming/t")
     assert recover(where) == ["t"]
     assert where.sweep() == 0
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
     assert where.committed() == {"t", "u"}
     for path in (where.folder / "trials" / "t").iterdir():
         assert path.stat().st_mode & 0o222 == 0
@@ -91,10 +91,10 @@ def test_trial_killed_on_its_way_to_quarantine_is_unfinished_and_moved(tmp_path:
     commit(where, "t")
     target = where.quarantine(where.folder / "trials" / "t", "again: dust")
     os.rename(target, where.folder / "trials" / "t")
-    assert [item.kind for item in verify(Store.open(tmp_path / "s"))] == ["unfinished"]
+    assert [item.kind for item in verify(TrialStore.open(tmp_path / "s"))] == ["unfinished"]
     assert where.sweep() == 1
     assert [item["cause"] for item in where.quarantined()] == ["again: dust"]
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_committed_trial_is_not_replaced(where: Campaign) -> None:

@@ -26,7 +26,7 @@ from sliplab.storage.trials.registration import (
     registrations,
     stamps,
 )
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, verify
 from tests.storage.remote.remotes import tree
 from tests.storage.trial_files import campaign, commit
@@ -82,7 +82,7 @@ def test_later_registration_is_numbered_and_chained(where: Campaign, tmp_path: P
     assert [path.name for path in (first, second, third)] == ["0001.json", "0002.json", "0003.json"]
     assert [it.previous for _, it in registrations(where)] == [None, sha256(first), sha256(second)]
     assert problems(where) == {}
-    assert verify(Store.open(tmp_path / "store")) == []
+    assert verify(TrialStore.open(tmp_path / "store")) == []
 
 
 def test_taken_number_is_never_overwritten(where: Any, monkeypatch: Any) -> None:
@@ -97,7 +97,7 @@ def test_taken_number_is_never_overwritten(where: Any, monkeypatch: Any) -> None
 
 
 def test_registered_campaign_without_trials_is_whole(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     registered(store.campaign("c"))
     assert verify(store) == []
     assert store.campaigns() == []
@@ -120,7 +120,7 @@ def test_changed_file_is_named(
     os.chmod(second, 0o644)
     second.write_text(text if isinstance(text, str) else json_text(text))
     assert what in problems(where)[name]
-    (found,) = verify(Store.open(tmp_path / "store"))
+    (found,) = verify(TrialStore.open(tmp_path / "store"))
     assert (Path(found.path).name, found.kind, found.campaign) == (name, DAMAGED, "c")
 
 
@@ -166,7 +166,7 @@ def test_damaged_earlier_registration_refuses_another_one(where: Campaign) -> No
 def test_temporary_and_foreign_files_are_named(path: Path, where: Campaign, tmp_path: Path) -> None:
     (path.parent / "notes.txt").write_text("")
     (path.parent / f".0002.json.{2**22 + 1}.tmp").write_text("")
-    found = {Path(it.path).name: it.kind for it in verify(Store.open(tmp_path / "store"))}
+    found = {Path(it.path).name: it.kind for it in verify(TrialStore.open(tmp_path / "store"))}
     assert found == {"notes.txt": DAMAGED, f".0002.json.{2**22 + 1}.tmp": UNFINISHED}
     where.sweep()
     assert [each.name for each in sorted(path.parent.iterdir())] == ["0001.json", "notes.txt"]
@@ -225,27 +225,27 @@ def test_push_and_pull_take_registrations_along(path: Any, where: Campaign, tmp_
     path.with_name("0001.json.tsr").write_bytes(bytes.fromhex(sha256(path)))
     commit(where, "a")
     remote = Remote(f"file://{tmp_path / 'shared'}")
-    assert push(Store.open(tmp_path / "store"), remote).problems == []
+    assert push(TrialStore.open(tmp_path / "store"), remote).problems == []
     registered(where)
-    assert push(Store.open(tmp_path / "store"), remote).problems == []
+    assert push(TrialStore.open(tmp_path / "store"), remote).problems == []
     assert verify_remote(remote) == (1, [])
     assert pull(remote, tmp_path / "copy").problems == []
     part = "campaigns/c/registrations"
     assert len(tree(tmp_path / "copy", part)) == 3
     assert tree(tmp_path / "copy", part) == tree(tmp_path / "store", part)
-    assert verify(Store.open(tmp_path / "copy")) == []
+    assert verify(TrialStore.open(tmp_path / "copy")) == []
 
 
 def test_pull_leaves_another_registration_as_it_is(where: Campaign, tmp_path: Path) -> None:
     commit(where, "a")
     remote = Remote(f"file://{tmp_path / 'shared'}")
-    push(Store.open(tmp_path / "store"), remote)
+    push(TrialStore.open(tmp_path / "store"), remote)
     pull(remote, tmp_path / "copy")
-    mine = Store.open(tmp_path / "copy").campaign("c")
+    mine = TrialStore.open(tmp_path / "copy").campaign("c")
     path = add_registration(mine, {**CONTENT, "planned": 4})
     before = path.read_bytes()
     registered(where)
-    push(Store.open(tmp_path / "store"), remote)
+    push(TrialStore.open(tmp_path / "store"), remote)
     (problem,) = pull(remote, tmp_path / "copy").problems
     assert "0001.json: differs" in problem
     assert path.read_bytes() == before

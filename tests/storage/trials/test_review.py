@@ -12,24 +12,24 @@ import pytest
 from sliplab.storage.process import user_name
 from sliplab.storage.trials import review
 from sliplab.storage.trials.review import ReviewedOnsets
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 OLD, NEW = ReviewedOnsets(100, 200), ReviewedOnsets(110, 250)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> TrialStore:
     """An empty one."""
-    return Store.create(tmp_path / "s")
+    return TrialStore.create(tmp_path / "s")
 
 
-def decide(store: Store, seen: int, verdict: Any = "adjust", **more: Any) -> review.Decision:
+def decide(store: TrialStore, seen: int, verdict: Any = "adjust", **more: Any) -> review.Decision:
     """One decision on the trial ``t``."""
     given = {"label": "k", "old": OLD, "new": NEW, "why": "blurred", **more}
     return review.decide(store, "c", "t", verdict, seen=seen, **given)
 
 
-def test_the_history_is_kept_whole(store: Store) -> None:
+def test_the_history_is_kept_whole(store: TrialStore) -> None:
     assert review.history(store, "c", "t") == []
     assert review.last(store, "c", "t") is None
     made = [
@@ -50,14 +50,14 @@ def test_the_history_is_kept_whole(store: Store) -> None:
     assert data["when"].endswith("+00:00")
 
 
-def test_who_looked_at_an_older_decision_is_told(store: Store) -> None:
+def test_who_looked_at_an_older_decision_is_told(store: TrialStore) -> None:
     decide(store, 0, who="anna", why="mine")
     with pytest.raises(review.Overtaken, match=r"adjust by anna, .*mine"):
         decide(store, 0, "accept")
     assert len(review.history(store, "c", "t")) == 1
 
 
-def test_of_many_who_decide_at_once_each_is_kept_or_told(store: Store) -> None:
+def test_of_many_who_decide_at_once_each_is_kept_or_told(store: TrialStore) -> None:
     def insist(name: str) -> int:
         for reported in range(100):
             try:
@@ -84,13 +84,15 @@ def test_of_many_who_decide_at_once_each_is_kept_or_told(store: Store) -> None:
         ("maybe", {}, "must be one of accept, adjust, reject, reopen"),
     ],
 )
-def test_what_cannot_be_is_not_kept(store: Store, verdict: str, more: Any, problem: str) -> None:
+def test_what_cannot_be_is_not_kept(
+    store: TrialStore, verdict: str, more: Any, problem: str
+) -> None:
     with pytest.raises(ValueError, match=problem):
         decide(store, 0, verdict, **more)
     assert review.history(store, "c", "t") == []
 
 
-def test_names_do_not_lead_out_of_the_store(store: Store) -> None:
+def test_names_do_not_lead_out_of_the_store(store: TrialStore) -> None:
     for name in ("../x", "a/b", ""):
         with pytest.raises(StoreError, match="cannot be the name"):
             review.decide(store, "c", name, "accept", label="k", old=OLD, new=OLD, seen=0)
@@ -99,7 +101,7 @@ def test_names_do_not_lead_out_of_the_store(store: Store) -> None:
 @pytest.mark.parametrize(
     "text", ["", "{}", "[]", "null", "\x00", '{"format": 99}', '{"format": "1"}', "{" * 5000]
 )
-def test_what_is_damaged_is_named_and_never_passed_over(store: Store, text: str) -> None:
+def test_what_is_damaged_is_named_and_never_passed_over(store: TrialStore, text: str) -> None:
     decide(store, 0)
     path = store.folder / "review" / "c" / "t" / "000001.json"
     path.write_text(text, encoding="utf-8")
@@ -108,7 +110,7 @@ def test_what_is_damaged_is_named_and_never_passed_over(store: Store, text: str)
     assert decide(store, 1, "accept").number == 2  # a new decision counts, the damaged one stays
 
 
-def test_onsets_are_whole_nanoseconds(store: Store) -> None:
+def test_onsets_are_whole_nanoseconds(store: TrialStore) -> None:
     decide(store, 0)
     path = store.folder / "review" / "c" / "t" / "000001.json"
     good = path.read_text()

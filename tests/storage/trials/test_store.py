@@ -8,7 +8,7 @@ import pytest
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import FRAME, commit, fail, fill, record
 
@@ -19,7 +19,7 @@ def test_a_committed_trial_reads_as_it_was_written(where: Campaign, tmp_path: Pa
     assert recording.record.counts.events == 1000
     assert len(recording.events()) == 1000
     assert len(list(recording.frames())) == 12
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_spooled_frames_are_the_same_video(where: Campaign) -> None:
@@ -38,14 +38,14 @@ def test_what_was_not_committed_is_quarantined_with_its_cause(where: Any, tmp_pa
     fill(writer)
     writer.abandon()
     assert where.committed() == set()
-    assert [p.what for p in verify(Store.open(tmp_path / "s"))] == [
+    assert [p.what for p in verify(TrialStore.open(tmp_path / "s"))] == [
         "is an unfinished trial; the next `sliplab collect` quarantines it"
     ]
     assert where.sweep() == 1
     assert [item["cause"] for item in where.quarantined()] == ["interrupted"]
     assert where.failed_attempts() == {}
     commit(where, "t")
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_a_failed_attempt_keeps_its_data_and_counts(where: Campaign) -> None:
@@ -67,18 +67,18 @@ def test_verify_sees_a_record_that_does_not_fit_its_data(where: Campaign, tmp_pa
     writer = where.begin("t", FRAME, 100)
     fill(writer, count=900)
     writer.commit(record("t"), Provenance())
-    (problem,) = verify(Store.open(tmp_path / "s"))
+    (problem,) = verify(TrialStore.open(tmp_path / "s"))
     assert problem.what == "900 events, the record says 1000"
 
 
 def test_a_folder_that_is_no_store_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(StoreError, match="holds other files"):
-        Store.create(tmp_path)
+        TrialStore.create(tmp_path)
     with pytest.raises(StoreError, match="is not a store"):
-        Store.open(tmp_path)
+        TrialStore.open(tmp_path)
     other = tmp_path / "new"
-    Store.create(other)
+    TrialStore.create(other)
     write_json(other / "store.json", {"format": 99})
     with pytest.raises(StoreError, match="format = 99"):
-        Store.open(other)
+        TrialStore.open(other)

@@ -11,7 +11,7 @@ from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import ClockReads, ExposureChunk, PulseChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import TIMING
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from sliplab.storage.trials.writer import TrialWriter
 from tests.storage.trial_files import FRAME, campaign, fill, record
@@ -56,7 +56,7 @@ def test_they_come_back_however_they_were_chunked(pieces: int, tmp_path: Path) -
                 assert np.array_equal(getattr(found, name), getattr(sent, name))
         counts = reader.counts()
     assert (counts["exposures/t"], counts["frame_camera_reads/after"]) == (COUNT, 300)
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
     with h5py.File(folder / "data.h5") as file:
         for name in TIMING.keys() - {"triggers/t", "triggers/kind"}:  # of imported trials
             assert file[name].attrs["unit"].startswith("ns of the ")
@@ -94,5 +94,5 @@ def test_verify_sees_a_clock_that_was_read_backwards(tmp_path: Path) -> None:
     writer.add("sync_box", BOX[:2])
     writer.add("sync_box", BOX[:1])
     writer.commit(record("t"), Provenance())
-    said = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
+    said = [problem.what for problem in verify(TrialStore.open(tmp_path / "s"))]
     assert said == [f"box_reads/{name} runs backwards" for name in ("t", "before", "after")]

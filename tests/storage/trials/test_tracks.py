@@ -13,7 +13,7 @@ from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import FrameChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.storage.trial_files import FRAME, campaign, commit, fill, record
 
@@ -68,7 +68,7 @@ def test_tracks_come_back_as_they_came(plate: bool, spool: bool, tmp_path: Path)
     else:
         assert found.plate_px is None
     assert np.array_equal(recording.frame_times(), np.arange(1403) * 10_000_000)
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_a_plate_that_comes_late_or_goes_leaves_gaps_and_no_shift(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_plate_that_comes_late_or_goes_leaves_gaps_and_no_shift(tmp_path: Path
     plate = recording.tracks().plate_px
     assert np.isfinite(plate[:, 0]).tolist() == [False] * 5 + [True] * 4 + [False] * 3 + [True] * 2
     assert np.array_equal(plate[5:9], chunks[1].plate_px)
-    assert verify(Store.open(tmp_path / "s")) == []
+    assert verify(TrialStore.open(tmp_path / "s")) == []
 
 
 def test_the_same_tracks_are_the_same_bytes_and_units_are_said(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_the_same_tracks_are_the_same_bytes_and_units_are_said(tmp_path: Path) -
 def test_the_catalogue_says_what_there_is(where: Campaign, tmp_path: Path) -> None:
     commit(where, "a")
     take(where, "b", [tracks(20, False)])
-    table = catalogue(Store.open(tmp_path / "s"))
+    table = catalogue(TrialStore.open(tmp_path / "s"))
     assert list(table["frame_source"]) == ["video", "tracks"]
     assert list(table["frames"]) == [12, 20]
 
@@ -141,4 +141,4 @@ def test_verify_sees_tracks_that_do_not_fit_their_frames(
 ) -> None:
     where = campaign(tmp_path / "s")
     _damage(take(where, "t", [tracks(20, True)]), name, rows)
-    assert [problem.what for problem in verify(Store.open(tmp_path / "s"))] == [says]
+    assert [problem.what for problem in verify(TrialStore.open(tmp_path / "s"))] == [says]

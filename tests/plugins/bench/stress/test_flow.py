@@ -23,7 +23,7 @@ from sliplab.plugins.bench.stress.document import StressRecord
 from sliplab.plugins.bench.stress.flow import measure_stress, request
 from sliplab.plugins.bench.stress.study import STUDY
 from sliplab.protocols import InputError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny
 
@@ -48,13 +48,13 @@ def disturbed(folder: Path, split: str = "test", **levels: list[Any]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[RunRequest], StudyOutcome]) -> Store:
+def store(ran: tuple[list[RunRequest], StudyOutcome]) -> TrialStore:
     """The small study."""
-    return Store.open(ran[0][0].store)
+    return TrialStore.open(ran[0][0].store)
 
 
 @pytest.fixture(scope="module")
-def made(store: Store, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressRecord]:
+def made(store: TrialStore, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressRecord]:
     """Its detectors under four trials."""
     folder = tmp_path_factory.mktemp("stress")
     asked = request(store, collected(store), disturbed(folder), None, folder / "out")
@@ -90,7 +90,7 @@ def test_every_detector_has_every_trial(made: tuple[Path, StressRecord]) -> None
 
 
 def test_numbers_and_page_say_simulated_and_nothing_is_taken_again(
-    made: tuple[Path, StressRecord], store: Store
+    made: tuple[Path, StressRecord], store: TrialStore
 ) -> None:
     folder, record = made
     kept = json.loads((folder / "out" / "stress.json").read_text())
@@ -112,7 +112,7 @@ def test_numbers_and_page_say_simulated_and_nothing_is_taken_again(
 
 
 def test_what_cannot_be_judged_is_refused_before_anything_is_taken(
-    store: Store, tmp_path: Path
+    store: TrialStore, tmp_path: Path
 ) -> None:
     def refused(protocol: Path) -> str:
         with pytest.raises(InputError) as error:
@@ -140,7 +140,7 @@ def test_a_campaign_with_nuisances_trains_only_if_it_is_asked_for(
         protocol = disturbed(tmp_path, "train", nuisance=["mix"], hold=[5])
         for file, name in ((slides, "slides"), (protocol, "disturbed")):
             collect(make_request(file, rig_path, room, campaign=name))
-        store = Store.open(room)
+        store = TrialStore.open(room)
         campaigns = collected(store)
         assert [item.name for item in campaigns] == ["slides", *["disturbed"] * trains]
         assert [item.name for item in collected(store, ["disturbed"])] == ["disturbed"]

@@ -35,7 +35,7 @@ from sliplab.protocols.detection import Detection
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.analysis.labels.reviewable import Reviewable, label
 from tests.command_line import here
 from tests.conftest import ROOT
@@ -45,7 +45,7 @@ AXES = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(0.5, 1.0))
 TRIALS = 20
 
 
-def made(folder: Path) -> Store:
+def made(folder: Path) -> TrialStore:
     """A kinematic campaign, and a gravity trial with the same events."""
     kinematic = Reviewable(folder, TRIALS)
     campaign = kinematic.store.campaign("gravity")
@@ -62,12 +62,14 @@ def made(folder: Path) -> Store:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     return made(tmp_path_factory.mktemp("tradeoff") / "store")
 
 
 @pytest.fixture(scope="module")
-def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> tuple[DetectorTradeoff, Path]:
+def result(
+    store: TrialStore, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[DetectorTradeoff, Path]:
     folder = tmp_path_factory.mktemp("out") / "new"
     found = tradeoff_detector(store, collected(store), folder, SIZE, AXES)
     assert found.named == {"made": 6}
@@ -102,7 +104,7 @@ def test_rows_are_of_every_setting_precision_stride_and_rule(
 
 
 def test_the_papers_row_is_what_its_rule_gives_on_every_window(
-    store: Store, result: tuple[DetectorTradeoff, Path]
+    store: TrialStore, result: tuple[DetectorTradeoff, Path]
 ) -> None:
     (paper,) = [row for row in result[0].rows if row.paper]
     search = detector_search(store, collected(store), SIZE, AXES)
@@ -183,7 +185,7 @@ def test_page_numbers_and_table_say_the_same(result: tuple[DetectorTradeoff, Pat
 
 
 def test_a_kept_search_is_not_made_again_and_grows(
-    store: Store, result: tuple[DetectorTradeoff, Path], tmp_path: Path
+    store: TrialStore, result: tuple[DetectorTradeoff, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "o"
 
@@ -236,7 +238,7 @@ def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
     assert models[0] == models[1]
 
 
-def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
+def test_windows_of_each_length_lie_in_the_same_stretches(store: TrialStore) -> None:
     trials = detector_search(store, collected(store), SIZE, AXES).trials
     for setting in (PAPER, NetworkSetting(length_ms=15)):
         found = trials.samples(setting, trials.train, 10_000)
@@ -250,7 +252,7 @@ def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
         assert found.start_ns[(found.trial == 0) & (found.y == 2)].min() == known.gross_ns
 
 
-def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) -> None:
+def test_a_stop_and_a_lack_of_labels_are_said(store: TrialStore, monkeypatch: Any) -> None:
     campaigns = [item for item in collected(store) if item.name == "gravity"]
     with pytest.raises(StoreError, match="no kinematic campaign"):
         detector_search(store, campaigns, SIZE, AXES)
@@ -266,7 +268,7 @@ def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) ->
 
 
 def test_the_command_names_what_is_wrong_and_knows_its_old_form(
-    store: Store, tmp_path: Path
+    store: TrialStore, tmp_path: Path
 ) -> None:
     for words, message in (
         ((), "STORE: is needed"),

@@ -28,7 +28,7 @@ from sliplab.plugins.studies.generalise.run import measure_generalisation, skin_
 from sliplab.plugins.studies.generalise.section import RESULT
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import json_text, read_json
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.command_line import here
 from tests.flows.conftest import shape_of
 
@@ -38,18 +38,18 @@ pytestmark = pytest.mark.long
 @pytest.fixture(scope="module")
 def store(
     ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
-) -> Store:
+) -> TrialStore:
     """A copy of the small study, tried without one direction and on one other skin."""
     folder = tmp_path_factory.mktemp("generalisation") / "store"
     shutil.copytree(ran[0][0].store, folder)
-    found = Store.open(folder)
+    found = TrialStore.open(folder)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(generalisation, "VALIDATION", 0.4)  # of six trials
         measure_generalisation(found, collected(found), ("direction",), skins=1, trials=4, epochs=1)
     return found
 
 
-def test_a_level_is_tested_on_and_not_trained_on(store: Store) -> None:
+def test_a_level_is_tested_on_and_not_trained_on(store: TrialStore) -> None:
     work = Generalisation(store, collected(store), 1)
     levels = work.levels("direction")
     assert levels == sorted(levels, key=lambda text: float(text.split()[0]))
@@ -69,7 +69,7 @@ def test_a_level_is_tested_on_and_not_trained_on(store: Store) -> None:
 
 
 def test_another_skin_is_another_skin_and_leaves_no_store(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = store.folder / "derived" / "generalisation"
     row = RESULT.read(store)["results"]["skin 101"]
@@ -88,7 +88,7 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     assert seen == [102]
 
 
-def test_what_is_kept_is_not_measured_again(store: Store) -> None:
+def test_what_is_kept_is_not_measured_again(store: TrialStore) -> None:
     asked = (store, collected(store), ("direction",))
     assert measure_generalisation(*asked, skins=1, trials=4, epochs=1).named["made"] == 0
     other = Generalisation(store, collected(store), 2)
@@ -107,7 +107,7 @@ def test_what_is_kept_is_not_measured_again(store: Store) -> None:
     before.write_text(text)
 
 
-def test_what_is_not_there_is_refused(store: Store) -> None:
+def test_what_is_not_there_is_refused(store: TrialStore) -> None:
     campaigns = collected(store)
     with pytest.raises(InputError, match=r"--factor.*must be a factor of the slides: "):
         measure_generalisation(store, campaigns, ("mass",))
@@ -167,7 +167,7 @@ def test_the_file_is_the_same_to_the_byte(tmp_path: Path) -> None:
     assert "| speed 1 mm/s | no train trials |" in (tmp_path / "results.md").read_text()
 
 
-def test_a_trained_level_has_these_keys(store: Store) -> None:
+def test_a_trained_level_has_these_keys(store: TrialStore) -> None:
     kept = read_json(store.folder / "derived/generalisation/results.json")
     assert shape_of(kept["results"]["direction 0 deg"]) == {
         "argmax": "float",
@@ -183,7 +183,7 @@ def test_a_trained_level_has_these_keys(store: Store) -> None:
     }
 
 
-def test_the_command_line(store: Store, tmp_path: Path) -> None:
+def test_the_command_line(store: TrialStore, tmp_path: Path) -> None:
     asked = ("--factor", "direction", "--skins", "1", "--trials", "4", "--epochs", "1")
     done = here("generalise", str(store.folder), *asked, "--json")
     assert done.returncode == 0, done.stderr
@@ -209,7 +209,7 @@ def test_the_command_line(store: Store, tmp_path: Path) -> None:
     assert read_json(Path(said["file"])) == kept
 
 
-def test_missing_label_names_the_trial_and_the_command(store: Store, tmp_path: Path) -> None:
+def test_missing_label_names_the_trial_and_the_command(store: TrialStore, tmp_path: Path) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
     shutil.rmtree(tmp_path / "store" / "derived" / "labels")
     done = here("generalise", str(tmp_path / "store"))

@@ -30,7 +30,7 @@ from sliplab.plugins.twin.statistics import SlideStatistics
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import IMPORTED, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, StoreError, TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -57,17 +57,17 @@ def rig_file(path: Path, **mock: Any) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     """Twelve trials, half of them references, labelled."""
     folder = tmp_path_factory.mktemp("drift")
     protocol = write(folder / "p.yaml", with_references(1, "1 mm"))
     rig = rig_file(folder / "rig.yaml")
     sliplab.collect(str(protocol), rig=rig, store=folder / "store").label()
-    return Store(folder / "store")
+    return TrialStore(folder / "store")
 
 
 @pytest.fixture
-def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+def worn(store: TrialStore, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """Worlds show their parameters; references show friction that falls from one to the next.
 
     Returns:
@@ -100,14 +100,14 @@ def worn(store: Store, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     return friction
 
 
-def calibrated(store: Store, out: Path, *more: object) -> CompletedProcess[str]:
+def calibrated(store: TrialStore, out: Path, *more: object) -> CompletedProcess[str]:
     """Run the command."""
     words = ("calibrate", "drift", store.folder, "--rig", "rehearsal", "--worlds", 100)
     return here(*words, "--out", out, *more)
 
 
 def test_friction_that_falls_is_found_and_nothing_else(
-    store: Store, worn: dict[str, float], tmp_path: Path
+    store: TrialStore, worn: dict[str, float], tmp_path: Path
 ) -> None:
     done = calibrated(store, tmp_path / "out", "--json", "--limit", 20)
     assert done.returncode == 0, done.stderr
@@ -130,7 +130,7 @@ def test_friction_that_falls_is_found_and_nothing_else(
 
 @pytest.mark.long
 def test_a_limit_that_is_exceeded_is_exit_1(
-    store: Store, worn: dict[str, float], tmp_path: Path
+    store: TrialStore, worn: dict[str, float], tmp_path: Path
 ) -> None:
     done = calibrated(store, tmp_path, "--limit", 5)
     assert done.returncode == 1
@@ -142,7 +142,7 @@ def test_a_limit_that_is_exceeded_is_exit_1(
 
 def fitted(folder: Path) -> None:
     rig, _ = load_rig_file(Path("rehearsal"))
-    store = Store(folder)
+    store = TrialStore(folder)
     (item,) = collected(store, None)
     drift.calibrate_drift(store, item, rig, worlds=100, spread=0.5, seed=1)
 
@@ -166,7 +166,7 @@ def test_a_campaign_without_references_to_fit_is_refused(tmp_path: Path) -> None
 
 
 def test_imported_campaigns_and_other_motions_have_no_drift(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab_hdf5(tmp_path / "slide.h5")
     words = ["import", tmp_path / "slide.h5", "--store", tmp_path / "s", "--name", "theirs"]
@@ -198,9 +198,9 @@ def change(tmp_path: Path, seed: int, per_m: float, limit: float | None = None) 
     store = tmp_path / "store"
     sliplab.collect(str(write(tmp_path / "p.yaml", data)), rig=rig, store=store).label()
     base, _ = load_rig_file(base_file)
-    (item,) = collected(Store(store), None)
+    (item,) = collected(TrialStore(store), None)
     return drift.calibrate_drift(
-        Store(store), item, base, worlds=150, spread=0.5, seed=1, limit_percent=limit
+        TrialStore(store), item, base, worlds=150, spread=0.5, seed=1, limit_percent=limit
     )
 
 

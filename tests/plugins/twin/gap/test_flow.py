@@ -28,7 +28,7 @@ from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.flows.conftest import tiny, tiny_gravity, write
 
@@ -70,15 +70,15 @@ def twin_file(path: Path, extends: str = "rehearsal") -> Path:
 @pytest.fixture(scope="module")
 def store(
     ran: tuple[list[RunRequest], StudyOutcome], tmp_path_factory: pytest.TempPathFactory
-) -> Store:
+) -> TrialStore:
     """A copy of the small study, which has a network of its own."""
     folder = tmp_path_factory.mktemp("gap") / "store"
     shutil.copytree(ran[0][0].store, folder)
-    return Store.open(folder)
+    return TrialStore.open(folder)
 
 
 @pytest.fixture(scope="module")
-def wanted(store: Store) -> gap.Gap:
+def wanted(store: TrialStore) -> gap.Gap:
     """What is asked for."""
     folder = store.folder.parent
     twin, protocol = twin_file(folder / "twin.yaml"), write(folder / "tiny.yaml", tiny())
@@ -114,7 +114,7 @@ def made(folder: Path) -> dict[Path, int]:
 
 
 def test_each_network_has_the_scores_of_its_evaluation(
-    found: TwinGap, wanted: gap.Gap, store: Store
+    found: TwinGap, wanted: gap.Gap, store: TrialStore
 ) -> None:
     assert [it.trained_on for it in found.networks] == ["own", "twin", "drawn", "assumed"]
     own = found.networks[0]
@@ -138,7 +138,7 @@ def test_trials_are_taken_on_the_rig_that_is_named(found: TwinGap, wanted: gap.G
     training = {trial.id for trial in wanted.plan if trial.split != "test"}
     frictions, taken, touched = {}, {}, {}
     for it in found.networks[1:]:
-        campaigns = collected(Store.open(wanted.out / it.trained_on))
+        campaigns = collected(TrialStore.open(wanted.out / it.trained_on))
         assert it.rigs == len(campaigns)
         taken[it.trained_on] = [{trial.id for trial, _ in item.trials} for item in campaigns]
         rigs = [
@@ -161,7 +161,7 @@ def test_trials_are_taken_on_the_rig_that_is_named(found: TwinGap, wanted: gap.G
 
 
 def test_numbers_and_page_are_kept_and_nothing_is_made_again(
-    found: TwinGap, wanted: gap.Gap, store: Store
+    found: TwinGap, wanted: gap.Gap, store: TrialStore
 ) -> None:
     written = read_json(wanted.out / "gap.json")
     assert TwinGap.load(wanted.out / "gap.json") == found
@@ -190,7 +190,7 @@ def test_numbers_and_page_are_kept_and_nothing_is_made_again(
 
 
 def test_a_twin_that_was_fitted_again_is_asked_for_another_folder(
-    found: TwinGap, wanted: gap.Gap, store: Store, tmp_path: Path
+    found: TwinGap, wanted: gap.Gap, store: TrialStore, tmp_path: Path
 ) -> None:
     again = twin_file(tmp_path / "twin.yaml")
     again.write_text(again.read_text().replace("0.75", "0.76"))
@@ -202,7 +202,7 @@ def test_a_twin_that_was_fitted_again_is_asked_for_another_folder(
 
 
 def test_what_cannot_be_compared_is_refused_before_anything_is_simulated(
-    store: Store, tmp_path: Path
+    store: TrialStore, tmp_path: Path
 ) -> None:
     twin, out, campaigns = twin_file(tmp_path / "twin.yaml"), tmp_path / "gap", collected(store)
     protocol = write(tmp_path / "tiny.yaml", tiny())

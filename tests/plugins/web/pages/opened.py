@@ -10,13 +10,13 @@ from sliplab.plugins.web.pages.app import application
 from sliplab.plugins.web.pages.web import Web
 from sliplab.plugins.web.review.trial_list import TrialList
 from sliplab.plugins.web.server.links import Role
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 ACCESS = Access({"operator": "o" * 40, "reader": "r" * 40})
 
 
 def opened(
-    store: Store,
+    store: TrialStore,
     reviews: TrialList | None = None,
     role: Role | None = "operator",
     port: int | None = None,

@@ -13,7 +13,7 @@ import pytest
 from sliplab.flows.log import log_entries
 from sliplab.flows.running import run_records
 from sliplab.flows.status import StatusReader
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.browser import expect, launched, needs_browser
 from tests.flows.conftest import write
@@ -104,7 +104,7 @@ def drive(browser: Any, link: str, folder: Path, protocol: str, planned: int) ->
     expect(anna.tab.locator("#status .notice")).to_have_count(0, timeout=LIMIT_MS)
     anna.stop()
     anna.sees("#now .big", "Nothing runs")
-    store = Store.open(folder)
+    store = TrialStore.open(folder)
     (status,) = StatusReader(store).read().campaigns
     assert status.committed < TRIALS
     ben = Person(browser, link, "Ben")

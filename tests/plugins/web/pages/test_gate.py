@@ -14,7 +14,7 @@ from starlette.websockets import WebSocketDisconnect
 from sliplab.plugins.web.pages.access import OPEN, Access
 from sliplab.plugins.web.pages.app import application
 from sliplab.plugins.web.pages.web import Web
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.web.pages.opened import ACCESS, csrf, opened
 from tests.storage.trial_files import campaign, commit
 
@@ -29,7 +29,7 @@ STREAM = "/live"
 def routes(root: Path) -> dict[str, set[str]]:
     """The methods of every path, with the trial of `store` in place of names; and of no path."""
     found: dict[str, set[str]] = {"/nowhere": set()}
-    for route in application(Web(Store.create(root), ACCESS)).routes:
+    for route in application(Web(TrialStore.create(root), ACCESS)).routes:
         if isinstance(route, Mount):
             found.setdefault(f"{route.path}/style.css", set()).add("GET")
             continue
@@ -47,12 +47,12 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> TrialStore:
     commit(campaign(tmp_path / "store", "tiny"), "a")
-    return Store.open(tmp_path / "store")
+    return TrialStore.open(tmp_path / "store")
 
 
-def contents(store: Store) -> dict[str, str]:
+def contents(store: TrialStore) -> dict[str, str]:
     """A digest of every file of a store but the catalogue, which is made of the others."""
     return {
         str(path.relative_to(store.folder)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -69,7 +69,7 @@ def test_every_subject_is_in_the_table(table: dict[str, set[str]]) -> None:
 
 
 def test_foreign_page_and_foreign_name_get_nothing(
-    store: Store, table: dict[str, set[str]]
+    store: TrialStore, table: dict[str, set[str]]
 ) -> None:
     """Not even with the operator's cookie and the form's token, by any method.
 
@@ -90,7 +90,7 @@ def test_foreign_page_and_foreign_name_get_nothing(
     assert contents(store) == before
 
 
-def test_without_a_link_there_is_no_page(store: Store, table: dict[str, set[str]]) -> None:
+def test_without_a_link_there_is_no_page(store: TrialStore, table: dict[str, set[str]]) -> None:
     stranger, before = browser(store, role=None), contents(store)
     forged = Access({"operator": "x" * 40, "reader": "y" * 40}).cookie("operator")
     for cookie in ("", forged, "operator..", "operator.a.b"):
@@ -108,7 +108,7 @@ def test_without_a_link_there_is_no_page(store: Store, table: dict[str, set[str]
     assert contents(store) == before
 
 
-def test_every_websocket_is_refused(store: Store, table: dict[str, set[str]]) -> None:
+def test_every_websocket_is_refused(store: TrialStore, table: dict[str, set[str]]) -> None:
     operator = browser(store)
     for path in table:
         for origin in ({}, {"origin": "http://evil.example"}):
@@ -120,7 +120,7 @@ def test_every_websocket_is_refused(store: Store, table: dict[str, set[str]]) ->
             assert refused.value.code == 1008, path
 
 
-def test_reader_can_do_nothing(store: Store, table: dict[str, set[str]]) -> None:
+def test_reader_can_do_nothing(store: TrialStore, table: dict[str, set[str]]) -> None:
     """Neither by a form's token of the reader's own, nor by the operator's; pages have no form."""
     reader, operator = (
         browser(store, role="reader"),
@@ -147,7 +147,7 @@ def test_reader_can_do_nothing(store: Store, table: dict[str, set[str]]) -> None
 
 
 def test_operator_changes_nothing_without_the_forms_token(
-    store: Store, table: dict[str, set[str]]
+    store: TrialStore, table: dict[str, set[str]]
 ) -> None:
     operator, other = (
         browser(store),
@@ -167,7 +167,7 @@ def test_operator_changes_nothing_without_the_forms_token(
     assert contents(store) == before
 
 
-def test_looking_changes_no_byte(store: Store, table: dict[str, set[str]]) -> None:
+def test_looking_changes_no_byte(store: TrialStore, table: dict[str, set[str]]) -> None:
     operator = browser(store)
     before = contents(store)
     for path, methods in table.items():

@@ -18,13 +18,13 @@ from sliplab.plugins.web.pages.live import Hub, event
 from sliplab.plugins.web.pages.web import Web
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.web.pages.opened import ACCESS, csrf, opened
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store.create(tmp_path / "store")
+def store(tmp_path: Path) -> TrialStore:
+    return TrialStore.create(tmp_path / "store")
 
 
 def act(found: TestClient, action: str, **fields: str) -> int:
@@ -43,7 +43,7 @@ async def first(stream: AsyncIterator[str], kind: str) -> str:
 
 
 def test_one_reader_serves_all_viewers_and_ends_with_the_last(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live, "TICK_S", 0.05)
     hub = Hub(Web(store, ACCESS))
@@ -68,7 +68,7 @@ def test_one_reader_serves_all_viewers_and_ends_with_the_last(
 
 
 def test_page_says_what_is_wrong_with_the_store(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub = Hub(Web(store, ACCESS))
 
@@ -91,7 +91,7 @@ def test_event_keeps_lines() -> None:
     assert event("now", "a\nb") == "event: now\ndata: a\ndata: b\n\n"
 
 
-def test_pause_and_resume_by_two_people_are_in_the_log(store: Store) -> None:
+def test_pause_and_resume_by_two_people_are_in_the_log(store: TrialStore) -> None:
     anna, ben = opened(store), opened(store)
     assert act(anna, "pause", why="lens dirty") == 422  # without a name
     assert act(anna, "pause", who="Anna", why="lens dirty") == 303
@@ -107,25 +107,25 @@ def test_pause_and_resume_by_two_people_are_in_the_log(store: Store) -> None:
     ]
 
 
-def test_request_to_a_running_collection_does_not_wait(store: Store) -> None:
+def test_request_to_a_running_collection_does_not_wait(store: TrialStore) -> None:
     with exclusive(store.folder / STORE_LOCK, "the store"):
         assert act(opened(store), "pause", who="Anna") == 303
         assert len(control.open_requests(store)) == 1
 
 
-def test_stop_needs_no_name_and_is_in_the_log(store: Store) -> None:
+def test_stop_needs_no_name_and_is_in_the_log(store: TrialStore) -> None:
     assert act(opened(store), "stop") == 303
     (entry,) = log_entries(store)
     assert (entry.what, entry.who) == ("stop", "the page, operator's link")
 
 
-def test_start_without_a_service_says_the_command(store: Store) -> None:
+def test_start_without_a_service_says_the_command(store: TrialStore) -> None:
     operator = opened(store)
     assert "sliplab collect PROTOCOL" in operator.get("/").text
     assert act(operator, "collect", who="Anna", protocol="pilot.yaml") == 422
 
 
-def test_schedules_show_next_runs(store: Store, tmp_path: Path) -> None:
+def test_schedules_show_next_runs(store: TrialStore, tmp_path: Path) -> None:
     file = tmp_path / "schedules.yaml"
     file.write_text(
         "timezone: Europe/Rome\nschedules:\n  - {name: morning, flow: report, cron: '30 7 * * *'}\n"
@@ -140,7 +140,7 @@ def test_schedules_show_next_runs(store: Store, tmp_path: Path) -> None:
     assert "is not a time zone" in found.get("/schedules").text
 
 
-def test_killed_collection_is_not_shown_as_running(store: Store) -> None:
+def test_killed_collection_is_not_shown_as_running(store: TrialStore) -> None:
     folder = LiveFolder(store.folder)
     folder.watch()
     state = {"trial": "gone", "attempt": 1, "phase": "hold", "number": 1, "campaign": "pilot"}

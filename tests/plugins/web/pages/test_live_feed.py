@@ -22,7 +22,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import console
 from sliplab.protocols.program import Dwell
 from sliplab.storage.streams import Chunk, EventChunk, FrameChunk, PulseChunk
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.plugins.web.server.serving import until
 
@@ -54,7 +54,7 @@ def feed(tmp_path: Path) -> LiveFeed:
     request = make_request(
         ROOT / "protocols" / "pilot.yaml", ROOT / "rigs" / "rehearsal.yaml", tmp_path / "store"
     )
-    Store.create(request.store)
+    TrialStore.create(request.store)
     return LiveFeed(request)
 
 

@@ -15,7 +15,7 @@ from sliplab.plugins.web.pages.gates import gate_texts
 from sliplab.plugins.web.pages.trial_curves import MOST_POINTS, thinned
 from sliplab.storage.schema.trial import Gate
 from sliplab.storage.trials import review
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.analysis.labels.reviewable import (
     FRAMES,
     NAME,
@@ -85,7 +85,7 @@ def test_condition_that_cannot_be_read_is_named(made: Reviewable, where: str) ->
 
 
 def test_empty_store_has_no_trials_and_nothing_to_review(tmp_path: Path) -> None:
-    page = opened(Store.create(tmp_path / "store"))
+    page = opened(TrialStore.create(tmp_path / "store"))
     assert "No trial was committed yet" in page.get("/trials").text
     assert page.get("/review").status_code == 200
     assert page.get("/review/rows").json()["rows"] == []

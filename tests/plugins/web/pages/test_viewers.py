@@ -20,7 +20,7 @@ from sliplab.plugins.web.pages import serving
 from sliplab.plugins.web.pages.app import application
 from sliplab.plugins.web.pages.web import Web
 from sliplab.storage.trials.checksums import read_sums
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.web.pages.opened import ACCESS
 from tests.plugins.web.server.serving import until
 
@@ -65,7 +65,7 @@ class Viewer(threading.Thread):
 
 
 @contextmanager
-def page(store: Store) -> Iterator[int]:
+def page(store: TrialStore) -> Iterator[int]:
     """The page of a store in a thread of this process; yields its port."""
     with serving.listen(0) as listener:
         port = int(listener.getsockname()[1])
@@ -92,7 +92,7 @@ def test_viewers_change_no_byte() -> None:
         expected = data(alone)
     with ExitStack() as stack:
         work = stack.enter_context(open_session("rehearsal", TRIALS))
-        store = Store.open(Path(work.collector.campaign.folder).parents[1])
+        store = TrialStore.open(Path(work.collector.campaign.folder).parents[1])
         port = stack.enter_context(page(store))
         dropped, silent = Viewer(port, cut=True), Viewer(port)
         others = [Viewer(port) for _ in range(VIEWERS - 2)]

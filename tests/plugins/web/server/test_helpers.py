@@ -12,12 +12,12 @@ from sliplab.plugins.web.server.helpers import keep_running
 from sliplab.plugins.web.server.schedules import has_alerts, load_schedules
 from sliplab.storage.process import send
 from sliplab.storage.trials.lock import current_holder
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 
 pytestmark = pytest.mark.programs
 
 
-async def holder_of(store: Store, other_than: int | None = None) -> dict[str, object]:
+async def holder_of(store: TrialStore, other_than: int | None = None) -> dict[str, object]:
     """Wait until a program watches the store."""
     async with asyncio.timeout(120):
         while True:
@@ -28,7 +28,7 @@ async def holder_of(store: Store, other_than: int | None = None) -> dict[str, ob
 
 
 def test_alerts_are_started_again_and_end_with_the_service(tmp_path: Path) -> None:
-    store = Store.create(tmp_path / "s")
+    store = TrialStore.create(tmp_path / "s")
     file = tmp_path / "schedules.yaml"
     file.write_text("timezone: UTC\nschedules: []\nalerts: {to: ['json://localhost']}\n")
     assert load_schedules(file) == []

@@ -16,7 +16,7 @@ import pytest
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.storage.files import read_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.plugins.web.server.serving import Page, processes, serving, until
@@ -42,7 +42,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         "timezone: UTC\nschedules:\n"
         f"  - {{name: copy, flow: push, url: 'file://{folder}/remote', cron: '0 0 1 1 *'}}\n"
     )
-    Store.create(folder / "store")
+    TrialStore.create(folder / "store")
     with serving(folder / "store", RIG, "ends", None, folder / "log", nights) as found:
         yield found
 

@@ -38,7 +38,7 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.campaign_end import STOPPING
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.plugins.web.server.serving import Page, clients, no_garbage_collection, until
@@ -64,7 +64,7 @@ def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
     # as if somebody could look
     monkeypatch.setattr(orchestration, "uses_private_server", lambda: False)
-    store = Store.create(tmp_path / "store")
+    store = TrialStore.create(tmp_path / "store")
     here = str(tmp_path)
     found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid(), (here,))
     found.export_environment()
@@ -193,7 +193,7 @@ def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> Non
     # collected and labelled; and nothing was trained that could be evaluated
     state = chain(ScheduledChain(protocol=protocol, trials=2, train=False), return_state=True)
     assert (state.type.value, "run `sliplab train` first" in state.message) == ("FAILED", True)
-    store = Store.open(service.folder)
+    store = TrialStore.open(service.folder)
     labels = Derived.of(store, "labels", campaign.NAME)
     assert all(labels.read(trial) for trial in store.campaign(campaign.NAME).committed())
     assert sorted(end["state"] for end in ends(service)) == [*["COMPLETED"] * 2, *["FAILED"] * 3]
@@ -339,7 +339,7 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
         parameters={"protocol": "p.yaml", "until": "06:00"},
     )
     when = serve._prefects([night])
-    store = Store.open(service.folder)
+    store = TrialStore.open(service.folder)
 
     async def register() -> None:
         made = await collect.ato_deployment(
@@ -401,7 +401,7 @@ def test_what_a_killed_service_had_taken_is_closed(
         await (await label.ato_deployment("label stranded")).aapply()
 
     asyncio.run(register())
-    page, store = Page(server.url, server.password, "stranded"), Store.open(service.folder)
+    page, store = Page(server.url, server.password, "stranded"), TrialStore.open(service.folder)
     taken, ours, waiting = (page.run("label")["id"] for _ in range(3))
     with get_client(sync_client=True) as client:
         for run in (taken, ours):

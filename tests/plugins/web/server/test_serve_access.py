@@ -18,7 +18,7 @@ import pytest
 
 from sliplab.plugins.web.server import page_server
 from sliplab.protocols import InputError
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.patching import loose
 from tests.plugins.web.server.serving import EVIL, Service, serving, until
@@ -181,7 +181,7 @@ def test_every_run_knows_the_password_by_itself(served: Service) -> None:
     ended = served.page.ended(run["id"])
     assert ended["type"] == "FAILED", ended  # the store has no campaign, and the run could say so
     assert "holds no campaign" in ended["message"] or "no campaign" in ended["message"]
-    assert Store.open(served.store).campaigns() == []
+    assert TrialStore.open(served.store).campaigns() == []
 
 
 def test_a_run_is_answered_nothing_of_files_elsewhere(served: Service) -> None:

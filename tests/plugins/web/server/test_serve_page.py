@@ -12,7 +12,7 @@ import pytest
 from sliplab.flows.log import log_entries
 from sliplab.plugins.web.pages.access import OPEN
 from sliplab.storage.trials import control
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.plugins.web.pages.test_gate import STREAM, routes
 from tests.plugins.web.server.serving import EVIL, Service, processes, until
 
@@ -43,7 +43,7 @@ def test_page_is_for_known_viewers_of_this_computer(served: Service, tmp_path: P
 
 def test_link_changes_nothing_without_its_form(served: Service, tmp_path: Path) -> None:
     form = {"Content_Type": "application/x-www-form-urlencoded"}
-    store = Store.open(served.store)
+    store = TrialStore.open(served.store)
     before = control.requests(store), log_entries(store)
     for role in ("reader", "operator"):
         known = entered(served, role)

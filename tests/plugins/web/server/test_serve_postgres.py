@@ -16,7 +16,7 @@ import yaml
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.storage.files import read_json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.plugins.web.server.serving import LIMIT_S, Page, serving, until
@@ -112,7 +112,7 @@ def test_a_campaign_is_paused_and_cancelled_and_goes_on(
     whole = campaign.hashes(tmp_path / "undisturbed")
     assert len(whole) == TRIALS
     assert campaign.hashes(store) == whole
-    asked = [(item.kind, item.who) for item in control.requests(Store.open(store))]
+    asked = [(item.kind, item.who) for item in control.requests(TrialStore.open(store))]
     assert asked == [("pause", "anna"), ("resume", "Prefect's page")]
     assert not campaign.wrong(store, whole)
     ends = [read_json(path) for path in (store / "control" / "runs").glob("*.end.json")]

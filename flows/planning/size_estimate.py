@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sliplab.protocols import Move, Plan, Trial, Twist
+from sliplab.protocols import Move, Plan, PlannedTrial, Twist
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.stream_settings import EventStream, FrameStream
 
@@ -12,7 +12,7 @@ TWIST_ARM_MM = 8.0
 """Mean distance of the papillae from the axis of a twist."""
 
 
-def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
+def trial_bytes(rig: RigFile, plan: Plan, trial: PlannedTrial) -> float:
     """Estimate the bytes of one committed trial."""
     known = rig.estimates
     seconds = plan.seconds(trial, recorded_only=True)

@@ -1,4 +1,4 @@
-"""Limits of motion that no trial of a protocol may exceed."""
+"""Limits that no trial of a protocol may exceed; those of a rig: `rigs.rig_limits`."""
 
 from __future__ import annotations
 
