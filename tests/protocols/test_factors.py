@@ -157,7 +157,8 @@ KNOWN = {
 @pytest.mark.parametrize("name", KNOWN)
 def test_trials_and_programs_of_shipped_protocols_stay(name: str) -> None:
     plan = load_plan(Path(name))
-    trials = repr([(trial, plan.seconds(trial)) for trial in plan])
+    # the class had this name then
+    trials = repr([(trial, plan.seconds(trial)) for trial in plan]).replace("PlannedT", "T")
     programs = repr([plan.program(trial) for trial in plan])
     found = [hashlib.sha256(text.encode()).hexdigest()[:24] for text in (trials, programs)]
     assert " ".join(found) == KNOWN[name]
