@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import re
+import select
 import sys
+import threading
 
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.shown import printable
 from sliplab.rigs.core.capabilities import Operator, RigError
 
+_LOOK_S = 0.1
+"""Time between two looks for an answer, s."""
+
 
 class ConsoleOperator:
-    """Prompts on the terminal; only the expected word confirms a task."""
+    """Prompts on the terminal; only the expected word confirms a task.
+
+    A question ends when another is asked: the rig asks in a thread while it watches the arm, and
+    after a fault it no longer wants the answer.
+    """
+
+    def __init__(self) -> None:
+        self._questions, self._reading = 0, threading.Lock()
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
         """Ask the operator to do `prompt`; the answer must be `expected`, or ``stop``.
@@ -23,6 +35,8 @@ class ConsoleOperator:
             raise RigError(
                 "operator", f"'{prompt}' needs an operator, but there is no terminal to ask on"
             )
+        self._questions += 1
+        number = self._questions
         while True:
             print(
                 printable(f"\n{task}: {prompt}\nType '{expected}' when it is done, or 'stop': "),
@@ -30,12 +44,29 @@ class ConsoleOperator:
                 file=sys.stderr,
                 flush=True,
             )
-            answer = sys.stdin.readline()
+            answer = self._answer(number)
             if not answer or answer.strip() == "stop":
                 return False
             if answer.split() == expected.split():
                 return True
             print(printable(f"That was '{answer.strip()}'."), file=sys.stderr)
+
+    def _answer(self, number: int) -> str:
+        """Return the next line; empty once another question was asked, or the input has ended."""
+        while True:
+            with self._reading:
+                if number != self._questions:
+                    return ""
+                if _has_line():
+                    return sys.stdin.readline()
+
+
+def _has_line() -> bool:
+    """Return whether the terminal has a line, after a short wait."""
+    try:
+        return bool(select.select([sys.stdin], [], [], _LOOK_S)[0])
+    except (OSError, ValueError, TypeError):  # no terminal that can be asked: reading waits
+        return True
 
 
 _MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")

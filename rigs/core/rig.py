@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -93,6 +95,16 @@ _TURN_DEG = 1.0
 """Turn of the tool from which the weight of the tool may show in a force sensor."""
 _STOP_RETRIES = 10
 """Attempts at a stop that Ctrl-C interrupts."""
+_SAME_SIGNAL_S = 0.2
+"""Signals that follow the first one sooner are the same: a wrapper may pass Ctrl-C on once more."""
+_REST_S, _REST_LIMIT_S = 0.2, 2.0
+"""Time between two poses that must agree after a stop, and the longest time until they do, s."""
+_REST_MM, _REST_DEG = 0.05, 0.1
+"""Largest difference of two poses of an arm at rest: measured poses are noisy."""
+_CLEAR_MM = 1.0
+"""Distance from the plate below which the sensor may touch it."""
+_UNWATCHED_S = 2.0
+"""Longest time without a look at a moving arm: a slow disk or computer must not hide its motion."""
 
 
 class StopRequested(Exception):
@@ -185,12 +197,20 @@ class Rig:
     """The arm's motion while it is watched."""
     _resting: Pose | None = field(default=None, init=False)
     """The end of the last motion, while the arm rests; None outside a program."""
+    _rests_at: Pose | None = field(default=None, init=False)
+    """Where the arm was seen after its last motion, and has to stay until the next."""
+    _looked_ns: int = field(default=0, init=False)
+    """When the moving arm was looked at last."""
+    _sent: bool = field(default=False, init=False)
+    """A motion was sent, and the arm was not seen at rest since."""
     _noise: NoiseWatch | None = field(default=None, init=False)
     """The event camera's noise while the arm approaches the plate."""
     _zeroed: bool = field(default=False, init=False)
     """The present load was taken for zero since the sensor was connected."""
     _fingers_mm: float | None = field(default=None, init=False)
     """Opening to which the fingers were last sent; None before."""
+    _insisted: bool = field(default=False, init=False)
+    """Ctrl-C came once more while the arm was being stopped: it does not retract."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
@@ -253,16 +273,13 @@ class Rig:
             ArmFault: everything is closed, but the arm could not be confirmed at rest. Not raised
                 again where `safely` has raised the same.
         """
-        fault: RigError | None = None
-        try:
-            fault = self._stop_arm()
-        finally:
-            for device in self._devices():
-                with suppress(Exception):
-                    device.close()
-            for end in self.on_close:
-                end()
         before = sys.exception()
+        with ExitStack() as closing:  # a signal that interrupts one does not keep the others open
+            for end in reversed(self.on_close):
+                closing.callback(end)
+            for device in reversed(self._devices()):
+                closing.callback(_close_quietly, device)
+            fault = self._stop_arm()
         if fault is not None and str(fault) not in {self._reported, str(before)}:
             text = f" (before that: {before})" if isinstance(before, RigError) else ""
             raise ArmFault("arm", f"{_text(fault)}{text}")
@@ -418,10 +435,16 @@ class Rig:
         finally:
             self._motion, self._resting = None, segment.to
 
+    def rests_here(self) -> None:
+        """Note where the arm stopped: leaving it before the next motion is a fault."""
+        if self._watches_closely:
+            self._rests_at = self.pose()
+
     def _send(self, segment: Segment, begin: Pose) -> None:
         """Check a segment, and send it: the one place from which the arm receives its motion."""
-        self._resting = None
+        self._resting = self._rests_at = None
         self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
+        self._sent, self._looked_ns = True, self.clock.now_ns()
         self.arm.start([segment])
         self._motion = MotionWatch(
             self.guard,
@@ -457,6 +480,7 @@ class Rig:
         home = Position(0.0, 0.0, -clearance_mm)
         with self.safely(home):
             out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+            self._come_clear(home)
             self.move(Move("home", home, out_mm_s), self.position(), None)
             self._open_fingers()
             if self._watches_closely:
@@ -555,8 +579,9 @@ class Rig:
                 state = self.arm.state()
                 if not state.healthy:  # the arm was stopped; the taught plane may still be right
                     raise arm_fault(state, "touching off")
+        self.rests_here()
         surface = rate.surface_mm(speed_mm_s)
-        if surface is not None:
+        if surface is not None and abs(surface - self.touch_mm) <= search_mm:
             return surface - self.touch_mm
         raise RigError(
             "arm",
@@ -615,10 +640,30 @@ class Rig:
             if self.plate is None:
                 raise RigError("plate", f"this rig has no sliding plate to {step.action}")
             self._plate_uncaught = step.action == "release" or self._plate_uncaught
-            self.plate.act(step.action, step.seconds)
+            self._move_plate(self.plate, step, sink)
             self._plate_uncaught = step.action == "release"
         self.wait(step.seconds, sink)
         return StepTimes(index, step.phase, start, self.arm.now_ns())
+
+    def _move_plate(self, plate: Plate, step: PlateStep, sink: Sink | None) -> None:
+        """Have the plate moved. A person may take minutes: the arm is watched meanwhile."""
+        if not self._watches_closely:
+            plate.act(step.action, step.seconds)
+            return
+        errors: list[BaseException] = []
+
+        def act() -> None:
+            try:
+                plate.act(step.action, step.seconds)
+            except BaseException as error:  # raised again where the arm is stopped
+                errors.append(error)
+
+        acting = threading.Thread(target=act, name="plate", daemon=True)
+        acting.start()
+        while acting.is_alive():
+            self.wait(self.poll_s, sink)
+        if errors:
+            raise errors[0]
 
     def move(self, step: Move, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Move from `at`, the arm's position, and wait for the end; return controller times, ns.
@@ -689,8 +734,10 @@ class Rig:
         Returns:
             start and end, controller times in ns, and True where it was stopped on the way.
         """
-        start = self.arm.now_ns()
+        start, stopped_ns = self.arm.now_ns(), None
         if seconds == 0:
+            if self._watches_closely:
+                self._check_end(segment, phase, sink)
             return start, start, False
         with self.moving(segment):
             deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
@@ -704,15 +751,21 @@ class Rig:
                     stop_s = left_s()
                     if not stop_s > 0:
                         self.arm.stop()
-                        return start, self.arm.now_ns(), True
+                        stopped_ns = self.arm.now_ns()
+                        break
                     most = min(stop_s / 2, force_watch.POLL_S)
                 left = seconds - (self.arm.now_ns() - start) / 1e9
                 self.wait(max(min(most, left), 1e-3), sink)
+            self._note_look()
+        if stopped_ns is not None:
+            self.rests_here()
+            return start, stopped_ns, True
         if not progress.state.healthy:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
         self._check_end(segment, phase, sink)
+        self._rests_at = segment.to
         return *progress.finished[-1], False
 
     def _check_end(self, segment: Segment, phase: str, sink: Sink | None) -> None:
@@ -762,18 +815,33 @@ class Rig:
             if self._motion is not None:
                 self._look(self._motion)
             elif resting is not None:  # no motion was sent, but another program may send one
-                self.guard.check_measured(
-                    self.pose(), resting, self.plate_frame, self._closed_mm, "at rest"
-                )
+                pose, plate = self.pose(), self.plate_frame
+                self.guard.check_measured(pose, resting, plate, self._closed_mm, "at rest")
+                if self._rests_at is not None and not is_near(pose, self._rests_at):
+                    raise PoseFault(
+                        "arm",
+                        f"moved {distance_mm(pose, self._rests_at):.1f} mm and "
+                        f"{angle_deg(pose, self._rests_at):.1f} deg while it should rest, and was "
+                        "stopped where it is: look what moves it",
+                    )
 
     def _look(self, motion: MotionWatch) -> None:
         """Hold the moving arm's pose against its motion, its limits and the forces."""
-        asked_ns = self.clock.now_ns()
+        asked_ns = self._note_look()
         pose = self.pose()
         motion.look(pose, asked_ns)
         if self._forces is not None and self._forces.needed:
             depth_mm = self.plate_frame.position(pose.xyz_mm).depth_mm + self._closed_mm
             self._forces.follow(pose, depth_mm)
+
+    def _note_look(self) -> int:
+        """Return the time of this look at the moving arm. Raises RigError if it is far too late."""
+        now_ns = self.clock.now_ns()
+        unwatched_s, self._looked_ns = (now_ns - self._looked_ns) * 1e-9, now_ns
+        if self._watches_closely and unwatched_s > _UNWATCHED_S:
+            text = f"did not look at the moving arm for {unwatched_s:.1f} s"
+            raise RigError("computer", f"{text}: its disk or its load is too much for a trial")
+        return now_ns
 
     def start_streams(
         self,
@@ -858,6 +926,7 @@ class Rig:
 
         The sensor is clear of the plate there, so a force sensor is zeroed.
         """
+        self._come_clear(home)
         if self._twisted:  # an earlier trial ended in its twist
             here = self.position()
             left = angle_deg(self.pose(), self.plate_frame.pose(here))
@@ -868,6 +937,20 @@ class Rig:
         self.begin_clear(seed, nuisances)
         for device in self.further:
             device.prepare()
+
+    def _come_clear(self, home: Position) -> None:
+        """Leave the plate straight out, as turned as now, where the sensor may still touch it.
+
+        A trial that ended in contact leaves it there: after a safe state, a fault that a person
+        cleared, or a way out that was interrupted.
+        """
+        begin, at = self.pose(), self.position()
+        if at.depth_mm <= max(home.depth_mm, -_CLEAR_MM):
+            return
+        out = self.plate_frame.pose(Position(at.x_mm, at.y_mm, home.depth_mm))
+        speed_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+        segment = Segment(replace(out, rotvec_deg=begin.rotvec_deg), speed_mm_s)
+        self._follow(segment, (at.depth_mm - home.depth_mm) / speed_mm_s, "come clear", None)
 
     def begin_clear(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Open the fingers, let the simulation draw its random values, zero the force sensor.
@@ -968,12 +1051,10 @@ class Rig:
             yield
         except BaseException as error:
             self._forces, self._resting, self._reading = None, None, ()
+            self._insisted = False
             fault: RigError | None = None
             try:
                 fault = self._stop_arm()
-                if self.gripper is not None:
-                    with suppress(Exception):
-                        self.gripper.stop()
                 if fault is None and not isinstance(error, StaysInContact):
                     fault = self._retract(clear, error)
             finally:
@@ -1002,21 +1083,60 @@ class Rig:
         return ArmFault("arm", text) if error.device == "arm" else RigError(error.device, text)
 
     def _stop_arm(self) -> RigError | None:
-        """Stop the arm; return None once it is at rest, else the error.
+        """Stop the arm, and then the fingers; return None once it was seen at rest, else the error.
 
-        A second Ctrl-C must not interrupt the stop.
+        A second Ctrl-C must not interrupt the stop. It is noted: the arm does not retract then.
         """
+        began, moving = time.monotonic(), 0
         for _ in range(_STOP_RETRIES):
             try:
                 self.arm.stop()
+                if self.gripper is not None:
+                    with suppress(Exception):
+                        self.gripper.stop()
+                if not self._sent or self._seen_at_rest():
+                    self._sent = False
+                    return None
+                moving += 1
             except KeyboardInterrupt:
-                continue
+                self._insisted = time.monotonic() - began > _SAME_SIGNAL_S
             except RigError as fault:
                 return fault
             except Exception as error:
                 return ArmFault("arm", f"could not be stopped: {error!r}; check the arm")
-            return None
+            if moving == 2:
+                return ArmFault("arm", "was stopped twice, and moves on: press the emergency stop")
         return ArmFault("arm", "could not be confirmed at rest: its stop was interrupted")
+
+    def _seen_at_rest(self) -> bool:
+        """Return whether the arm's path has ended and two poses after it agree. Raises ArmFault."""
+        deadline = self.clock.now_ns() + round(_REST_LIMIT_S * 1e9)
+        before = self.pose()
+        while self.clock.now_ns() < deadline:
+            self.clock.wait(_REST_S)
+            here = self.pose()
+            same = distance_mm(before, here) <= _REST_MM and angle_deg(before, here) <= _REST_DEG
+            if same and self._path_over():
+                return True
+            before = here
+        return False
+
+    def _path_over(self) -> bool:
+        try:
+            return self.arm.progress().done
+        except RigError:  # it was aborted, for the reason that is reported already
+            return True
+
+    def _left_in_contact(self) -> RigError | None:
+        """Return the error for a way out that a person prevented; None where the arm is clear."""
+        depth_mm = self.position().depth_mm
+        if depth_mm <= -_CLEAR_MM:
+            return None
+        return ArmFault(
+            "arm",
+            f"did not come clear of the plate: its way out was interrupted at a depth of "
+            f"{depth_mm:.2f} mm; look at it: the next trial begins with the way straight out",
+        )
 
     def _retract(self, clear: Position, error: BaseException) -> RigError | None:
         """Retract straight out along the plate's normal if the arm is healthy, bounded in time.
@@ -1030,20 +1150,23 @@ class Rig:
         try:
             if not self.arm.state().healthy:
                 return None
+            if self._insisted:
+                return self._left_in_contact()
             begin, at = self.pose(), self.position()
             out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
             if at.distance_mm(out) == 0:
                 return None
-            pose, speed_mm_s = self.plate_frame.pose(out), self.at_most(RETRACT_SPEED_MM_S)
-            if self._twisted:  # straight out with its present rotation; it turns back once clear
-                pose = replace(pose, rotvec_deg=begin.rotvec_deg)
+            # with its present rotation: it turns back once clear
+            pose = replace(self.plate_frame.pose(out), rotvec_deg=begin.rotvec_deg)
+            speed_mm_s = self.at_most(RETRACT_SPEED_MM_S)
             blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
             if self.force is not None and self._watches_closely and not blind:
                 with suppress(RigError):
                     self._watch_forces(leaving=True)
             self._send(Segment(pose, speed_mm_s), begin)
-            polls = int((at.distance_mm(out) / speed_mm_s + 2.0) / self.poll_s) + 1
-            for _ in range(polls):
+            most_s = at.distance_mm(out) / speed_mm_s + 2.0 + self.poll_s
+            deadline = self.clock.now_ns() + round(most_s * 1e9)
+            while self.clock.now_ns() < deadline:
                 if (progress := self.arm.progress()).done:
                     if progress.finished:
                         return None
@@ -1055,8 +1178,10 @@ class Rig:
         except RigError as fault:
             return self._stop_arm() or fault
         except BaseException:
-            self._stop_arm()
-            raise
+            left = self._stop_arm() or self._left_in_contact()
+            if left is None:
+                raise
+            return left
         finally:
             self._motion = self._forces = None
 
@@ -1070,6 +1195,12 @@ class Rig:
             if not _of_sensor(fault):
                 raise
             self._forces = None
+
+
+def _close_quietly(device: Any) -> None:
+    """Close a device; its faults no longer matter."""
+    with suppress(Exception):
+        device.close()
 
 
 def _seconds(way: float, speed: float) -> float:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 
 import pytest
 
 from sliplab.rigs.core.capabilities import Clock, Operator, Plate, RigError
 from sliplab.rigs.core.host_clock import HostClock
-from sliplab.rigs.core.operators import PersonAtPlate, mass_of
+from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate, mass_of
 
 
 class Person:
@@ -80,3 +82,25 @@ def test_the_hosts_clock_is_the_one_that_drivers_stamp_by() -> None:
     clock.wait(0.02)
     assert clock.now_ns() - now >= 20_000_000
     clock.wait(-1.0)  # nothing to wait for
+
+
+def test_a_question_that_nobody_waits_for_takes_no_answer(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After a fault the rig asks something else while the first question is still open."""
+    ours, theirs = os.openpty()
+    with open(theirs) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        console, first, answer = ConsoleOperator(), list[bool](), list[bool]()
+        old = threading.Thread(target=lambda: first.append(console.ask("plate", "raise", "raised")))
+        old.start()
+        while "raised" not in capsys.readouterr().err:
+            assert old.is_alive()
+        new = threading.Thread(target=lambda: answer.append(console.ask("mass", "mount", "0.2 kg")))
+        new.start()
+        old.join(10.0)
+        assert first == [False]
+        os.write(ours, b"wrong\n0.2 kg\n")
+        new.join(10.0)
+        assert answer == [True]
+    os.close(ours)

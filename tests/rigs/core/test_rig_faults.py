@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sliplab.protocols import load_plan
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.rigs.core import rig as rig_module
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, PoseFault, RigError, Segment
+from sliplab.rigs.core.plate_frame import turned_about_z
+from sliplab.rigs.core.rig import Rig
+from sliplab.storage.streams import NullSink
 from tests.conftest import ROOT
-from tests.patching import put
+from tests.patching import loose, put
 from tests.rigs.core.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
 
 STOPS = ["arm.stop", "events.stop", "frames.stop", "sync.stop"]
@@ -176,7 +184,7 @@ def test_ctrl_c_while_the_arm_moves_clear_stops_it(rig: Any) -> None:
 
     put(sink, "keep_events", full)
     rig.arm.start, rig.clock.wait = noted, interrupted  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(ArmFault, match=r"way out was interrupted at a depth of \d\.\d+ mm"):
         run(rig, short_plan(), sink)
     assert rig.arm.state() is ArmState.READY  # it stands, half-way clear
 
@@ -233,3 +241,200 @@ def test_a_plate_that_was_caught_or_never_let_go_is_not_told_of() -> None:
     with pytest.raises(RigError, match="does not answer") as caught:
         run(rig, short_plan(), Memory())
     assert "plate" not in str(caught.value)
+
+
+SLIDE = Program(
+    HOME := Position(0.0, 0.0, -2.0),
+    (
+        Move("approach", Position(-6.0, 0.0, -2.0), 10.0),
+        Move("press", Position(-6.0, 0.0, 2.4), 2.0),
+        Dwell("hold", 1.0, recorded=True),
+        Move("slide", Position(6.0, 0.0, 2.4), 1.0, recorded=True),
+        Move("release", HOME, 5.0),
+    ),
+)
+
+
+def real(fault: str = "") -> Rig:
+    """A rig that is watched as a real one, whose driver's method `fault` does nothing from now."""
+    rig: Rig = make_rig()
+    rig.simulation = None
+    if fault:
+        put(rig.arm, fault, lambda: None)
+    return rig
+
+
+def placed(rig: Rig, *way: Position) -> None:
+    """Move the arm as a person does, without the program."""
+    for place in way:
+        rig.arm.start([Segment(rig.plate_frame.pose(place), 50.0)])
+        while not rig.arm.progress().done:
+            rig.clock.wait(0.01)
+
+
+def in_slide(rig: Rig) -> bool:
+    place = rig.position()
+    return place.depth_mm > 2.39 and place.x_mm > -2.0
+
+
+def interrupted_at(rig: Rig, *conditions: Callable[[], bool]) -> None:
+    """Press Ctrl-C when each of the conditions holds, one after the other."""
+    wait, left = rig.clock.wait, list(conditions)
+
+    def interrupted(seconds: float) -> None:
+        wait(seconds)
+        if left and left[0]():
+            left.pop(0)
+            raise KeyboardInterrupt
+
+    put(rig.clock, "wait", interrupted)
+
+
+def test_an_arm_that_moves_on_after_its_stop_is_told_of() -> None:
+    rig = real("stop")
+    interrupted_at(rig, lambda: in_slide(rig))
+    with pytest.raises(ArmFault, match="stopped twice, and moves on: press the emergency stop"):
+        run_program(rig)
+
+
+def test_an_arm_that_moves_while_it_should_rest_is_stopped() -> None:
+    """Another program moves it within its limits while it rests in the hold."""
+    rig = real()
+
+    def intruder(step: Step) -> None:
+        if step.phase == "hold":
+            rig.arm.start([Segment(rig.plate_frame.pose(HOME), 50.0)])
+
+    with pytest.raises(PoseFault, match=r"moved \d\.\d mm and 0\.0 deg while it should rest"):
+        rig.run_trial(SLIDE, NullSink(), 1, None, 100, on_step=intruder)
+
+
+def test_the_second_ctrl_c_during_the_stop_prevents_the_way_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = real()
+    interrupted_at(rig, lambda: in_slide(rig), lambda: True)
+    monkeypatch.setattr(rig_module, "_SAME_SIGNAL_S", 0.0)
+    notes = watched(rig)
+    with pytest.raises(ArmFault, match=r"its way out was interrupted at a depth of 2\.40 mm"):
+        run_program(rig)
+    assert "arm.start" not in after_the_stop(notes)
+
+
+def test_a_signal_that_is_passed_on_twice_does_not_prevent_the_way_out() -> None:
+    rig = real()
+    interrupted_at(rig, lambda: in_slide(rig), lambda: True)
+    with pytest.raises(KeyboardInterrupt):
+        run_program(rig)
+    assert rig.position().depth_mm == pytest.approx(-2.0, abs=0.01)
+
+
+@pytest.mark.parametrize("begin", ["begin_trial", "press"])
+def test_an_arm_in_contact_leaves_the_plate_straight_out_first(begin: str) -> None:
+    rig, places = real(), []
+    placed(rig, Position(-8.0, 0.0, -3.0), Position(-8.0, 0.0, 2.4))
+    start = rig.arm.start
+
+    def noted(path: Any) -> None:
+        places.append(rig.plate_frame.position(path[0].to.xyz_mm))
+        start(path)
+
+    put(rig.arm, "start", noted)
+    if begin == "begin_trial":
+        rig.begin_trial(HOME, 1)
+    else:
+        rig.press(1.0, 2.0, 2.0, 1)
+    assert [round(number, 6) for number in (places[0].x_mm, places[0].depth_mm)] == [-8.0, -2.0]
+    assert [round(number, 6) for number in (places[1].x_mm, places[1].depth_mm)] == [0.0, -2.0]
+
+
+def test_the_way_out_keeps_the_turn_of_the_tool() -> None:
+    rig = real()
+    leaning = rig.plate_frame.pose(Position(0.0, 0.0, 1.0))
+    leaning = replace(leaning, rotvec_deg=turned_about_z(leaning.rotvec_deg, 20.0))
+    rig.arm.start([Segment(leaning, 50.0)])
+    while not rig.arm.progress().done:
+        rig.clock.wait(0.01)
+    with pytest.raises(RuntimeError), rig.safely(HOME):
+        raise RuntimeError
+    assert rig.pose().rotvec_deg == pytest.approx(leaning.rotvec_deg, abs=1e-6)
+    assert rig.position().depth_mm == pytest.approx(-2.0, abs=1e-6)
+
+
+def test_the_arm_is_watched_while_a_person_moves_the_plate() -> None:
+    rig = real()
+    answered, moved, threads = threading.Event(), [], threading.active_count()
+
+    class SlowPerson:
+        def act(self, action: str, seconds: float) -> None:
+            assert answered.wait(20.0)
+
+        def mass_kg(self) -> float:
+            return 0.2
+
+    def pushed() -> bool:
+        if threading.active_count() > threads and not moved:
+            moved.append(True)
+            rig.arm.start([Segment(rig.plate_frame.pose(HOME), 50.0)])
+        return False
+
+    rig.plate = SlowPerson()
+    interrupted_at(rig, pushed)
+    steps = (*SLIDE.steps[:2], PlateStep("plate", "release", 1.0), *SLIDE.steps[2:])
+    try:
+        with pytest.raises(ArmFault, match=r"while it should rest.*The plate was released"):
+            rig.run_trial(Program(HOME, steps), NullSink(), 1, None, 100)
+    finally:
+        answered.set()
+
+
+def test_what_the_plate_raises_in_its_thread_ends_the_trial() -> None:
+    rig = real()
+
+    class Refusing:
+        def act(self, action: str, seconds: float) -> None:
+            raise RigError("plate", "was not confirmed")
+
+    rig.plate = loose(Refusing())
+    steps = (*SLIDE.steps[:2], PlateStep("plate", "raise", 1.0), *SLIDE.steps[2:])
+    with pytest.raises(RigError, match="plate: was not confirmed"):
+        rig.run_trial(Program(HOME, steps), NullSink(), 1, None, 100)
+
+
+def test_a_disk_that_blocks_while_the_arm_moves_ends_the_trial() -> None:
+    rig = real()
+
+    class Blocking(NullSink):
+        def add(self, device: str, chunk: Any) -> None:
+            if rig.position().x_mm > 0.0:
+                rig.clock.wait(3.0)
+
+    with pytest.raises(RigError, match=r"did not look at the moving arm for \d+\.\d s"):
+        rig.run_trial(SLIDE, Blocking(), 1, None, 100)
+
+
+def test_a_move_from_elsewhere_than_was_said_is_not_done() -> None:
+    rig = real()
+    placed(rig, Position(-5.0, 0.0, -2.0))
+    with pytest.raises(PoseFault, match="reports the phase 'home' as finished"):
+        rig.move(Move("home", HOME, 10.0), HOME)
+
+
+def test_ctrl_c_while_a_device_is_closed_closes_the_others() -> None:
+    rig, ended = real(), []
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    put(rig.arm, "close", interrupted)
+    rig.on_close = (lambda: ended.append("files"),)
+    notes = watched(rig)
+    with pytest.raises(KeyboardInterrupt):
+        rig.close()
+    closed = [call for call in notes if call.endswith("close")]
+    assert closed == ["arm.close", "events.close", "frames.close", "sync.close"]
+    assert ended == ["files"]
+
+
+def run_program(rig: Rig) -> None:
+    rig.run_trial(SLIDE, NullSink(), 1, None, 100)
