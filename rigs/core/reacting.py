@@ -114,7 +114,7 @@ class Reaction:
             a driver's way to its device is in it.
         stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.
         depth_mm: final depth in contact: the arm's, and what the fingers add.
-        closed_mm: by how much the fingers closed.
+        closed_mm: by how much the fingers are closed, with what an earlier grip closed.
         stalled: they ended at their force.
         evidence: times of the detection, where the watcher measures them.
     """
@@ -266,7 +266,7 @@ def _react(
         return (rig.clock.now_ns() - began_ns) / 1e6
 
     watcher.armed = False
-    closed_mm = 0.0
+    closed_mm = rig._closed_mm
     try:
         if reflex.kind == "grip" and phase in _LEVEL:
             closed_mm = _grip(rig, reflex)
@@ -288,13 +288,18 @@ def _react(
     stalled = False
     if reflex.kind == "press":
         # measured depths scatter about the command; the limit applies all the same
-        depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm)
+        depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm - closed_mm)
         if not depth <= here.depth_mm:  # a depth that is no number is refused by the rig
             deep = Position(here.x_mm, here.y_mm, depth)
             rig.move(Move("reflex", deep, reflex.speed_mm_s), here, sink)
     if rig.gripper is not None and closed_mm:
-        state = rig.await_fingers(rig.gripper, sink)
-        closed_mm, stalled = rig.grip_opening_mm - state.opening_mm, state.stalled
+        try:
+            state = rig.await_fingers(rig.gripper, sink)
+            closed_mm, stalled = rig.grip_opening_mm - state.opening_mm, state.stalled
+        except RigError as fault:
+            # a stop lets an earlier grip end; a gripper that fails does not keep it from ending
+            if fault.device != GRIPPER or reflex.kind == "grip":
+                raise
     return Reaction(
         phase,
         stop_ms,
@@ -309,13 +314,18 @@ def _react(
 
 
 def _grip(rig: Rig, reflex: Reflex) -> float:
-    """Start to close the fingers, and return by how much, mm; not beyond the deepest place."""
+    """Start to close the fingers further, not beyond the deepest place, and never open them.
+
+    Returns:
+        by how much they are then closed in all, mm.
+    """
     if rig.gripper is None:
         raise RigError(GRIPPER, "this rig has none to tighten")
+    already_mm = rig._closed_mm  # by an earlier grip: less would drop what it holds
     room_mm = reflex.deepest_mm - rig.position().depth_mm
-    closed_mm = min(reflex.deeper_mm, room_mm)
-    if closed_mm <= 0:
-        return 0.0
+    closed_mm = min(already_mm + reflex.deeper_mm, room_mm)
+    if not closed_mm > already_mm:
+        return already_mm
     rig.move_fingers(rig.grip_opening_mm - closed_mm, reflex.speed_mm_s, reflex.force_n)
     return closed_mm
 

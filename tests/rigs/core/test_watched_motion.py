@@ -29,7 +29,7 @@ from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
 from sliplab.rigs.core.motion_watch import MeasuredSpeedError
 from sliplab.rigs.core.plate_frame import turned_about_z
-from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
+from sliplab.rigs.core.reacting import Reflex, SafeState, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
 from sliplab.rigs.rig_file import RigFile, load_rig_file
@@ -820,6 +820,57 @@ def test_reflex_press_stops_at_the_rigs_limit_of_depth() -> None:
         run_watched(rig, PROGRAM, Watcher(slip=True), 1, 100, Reflex("press", 9.0, 3.0, 2.0))
     deepest = max(rig.plate_frame.position(s.to.xyz_mm).depth_mm for s in arm.started)
     assert deepest == pytest.approx(2.4)
+
+
+class LostAfterReflex(Watcher):
+    """A watcher that says slip, and can detect no more while the arm then rests."""
+
+    def __init__(self) -> None:
+        super().__init__(slip=True)
+        self._phase = ""
+
+    def step(self, phase: str, acting: bool) -> None:
+        self._phase = phase
+
+    def add(self, device: str, chunk: Chunk) -> None:
+        super().add(device, chunk)
+        if self._phase == "reflex" and not self.armed and self.guarded:
+            raise SenseLost("event camera: silent")
+
+
+@pytest.mark.parametrize(
+    ("kind", "deepest_mm", "closed_mm"),
+    [("grip", 4.0, 1.0), ("grip", 3.3, 0.9), ("grip", 3.2, 0.8), ("stop", 4.0, 0.8)],
+)
+def test_safe_state_after_a_grip_never_opens_the_fingers(
+    kind: Any, deepest_mm: float, closed_mm: float
+) -> None:
+    """The grip of a reflex holds the object: the safe state closes further, up to the depth."""
+    rig = make_rig("mock-gripper", None)
+    wanted = Reflex("grip", 4.0, 0.8, 20.0, 50.0, 0.2)
+    sent: list[float] = []
+    move = rig.gripper.move
+
+    def noted(opening_mm: float, *rest: float) -> None:
+        sent.append(opening_mm)
+        move(opening_mm, *rest)
+
+    put(rig.gripper, "move", noted)
+    with pytest.raises(SafeState) as safe:
+        run_watched(
+            rig,
+            PROGRAM,
+            LostAfterReflex(),
+            1,
+            100,
+            wanted,
+            Reflex(kind, deepest_mm, 0.2, 20.0, 50.0),
+        )
+    assert sent == sorted(sent, reverse=True)
+    assert rig.gripper.state().opening_mm == pytest.approx(40.0 - closed_mm, abs=0.02)
+    made = safe.value.reaction
+    assert made.closed_mm == pytest.approx(closed_mm, abs=0.02)
+    assert made.depth_mm == pytest.approx(2.4 + closed_mm, abs=0.03)
 
 
 # -- events and frames that stop ---------------------------------------------------------------
