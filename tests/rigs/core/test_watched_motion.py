@@ -873,6 +873,78 @@ def test_safe_state_after_a_grip_never_opens_the_fingers(
     assert made.depth_mm == pytest.approx(2.4 + closed_mm, abs=0.03)
 
 
+def after_reflex(kind: Any, steps: tuple[Any, ...]) -> tuple[Rig, list[Segment]]:
+    """A rig and what its arm was sent after a reflex in the first motion in contact."""
+    rig = make_rig("mock-gripper", None)
+    rig.poll_s = 0.02
+    watcher, sent = Watcher(slip=True), []
+    arm = with_arm(rig)
+
+    def step(phase: str, acting: bool) -> None:
+        if phase == "reflex" and not sent:
+            sent.append(len(arm.started))
+            watcher._slip = False
+
+    put(watcher, "step", step)
+    reflex = Reflex(kind, 4.0, 0.3, 20.0 if kind == "grip" else 2.0, 50.0, 0.1)
+    assert run_watched(rig, Program(HOME, steps), watcher, 1, 100, reflex) is not None
+    return rig, arm.started[sent[0] + (kind == "press") :]
+
+
+@pytest.mark.parametrize("kind", ["stop", "press", "grip"])
+@pytest.mark.parametrize("leaving", ["release", "retract"])
+def test_after_a_reflex_the_arm_only_leaves_straight_out(kind: Any, leaving: str) -> None:
+    """What was planned in contact would drag what is held, or press it deeper."""
+    turned = Position(0.0, 0.0, 3.2, twist_deg=20.0)
+    out = Position(2.0, 0.0, -0.5)
+    rig, sent = after_reflex(
+        kind,
+        (
+            *PROGRAM.steps[:3],
+            Move("slide", Position(0.0, 0.0, 3.2), 3.0, recorded=True),
+            Twist("twist", turned, 20.0, recorded=True),
+            Dwell("hold", 0.1, recorded=True),
+            *([Move("retract", out, 10.0, recorded=True)] if leaving == "retract" else []),
+            Move("release", HOME, 10.0),
+            Move("return", HOME, 10.0),
+        ),
+    )
+    places = [rig.plate_frame.position(segment.to.xyz_mm) for segment in sent]
+    depths_mm = [place.depth_mm for place in places]
+    straight = [-0.5, -2.0, -2.0] if leaving == "retract" else [-2.0, -2.0]
+    assert depths_mm == pytest.approx(straight, abs=1e-6)
+    assert all(0.0 < place.x_mm < 0.5 for place in places[:-1])  # the slide was to 3 mm
+    assert len({round(place.x_mm, 9) for place in places[:-1]}) == 1
+    assert places[-1].x_mm == pytest.approx(0.0)
+    assert [segment.turn_deg_s for segment in sent] == [None] * len(sent)
+    assert rig.position().depth_mm == pytest.approx(-2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["stop", "press"])
+def test_after_a_reflex_a_turned_sensor_turns_back_once_clear(kind: Any) -> None:
+    turned = replace(DEEP, twist_deg=20.0)
+    away = replace(turned, x_mm=3.0)
+    rig, sent = after_reflex(
+        kind,
+        (
+            PROGRAM.steps[0],
+            Dwell("hold", 0.1, recorded=True),
+            Twist("twist", turned, 20.0, recorded=True),
+            Move("move", away, 3.0, recorded=True),
+            Move("release", replace(away, depth_mm=-2.0), 10.0),
+            Twist("untwist", Position(3.0, 0.0, -2.0), 20.0),
+            Move("return", HOME, 10.0),
+        ),
+    )
+    release, untwist, back = sent
+    straight = rig.plate_frame.pose(HOME).rotvec_deg
+    assert release.to.rotvec_deg == turned_about_z(straight, 20.0)
+    assert untwist.to.xyz_mm == release.to.xyz_mm
+    assert untwist.turn_deg_s == 20.0
+    assert untwist.to.rotvec_deg == back.to.rotvec_deg == straight
+    assert not rig._twisted
+
+
 # -- events and frames that stop ---------------------------------------------------------------
 
 
