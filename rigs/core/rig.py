@@ -190,7 +190,7 @@ class Rig:
     _zeroed: bool = field(default=False, init=False)
     """The present load was taken for zero since the sensor was connected."""
     _fingers_mm: float | None = field(default=None, init=False)
-    """Opening to which the fingers were last sent; None before."""
+    """Opening to which the fingers were last sent, or that they had when connected."""
     _reported: str = field(default="", init=False)
     """Text of the failed stop that `safely` has raised already."""
     _twisted: bool = field(default=False, init=False)
@@ -243,6 +243,8 @@ class Rig:
         for device in (self.force, self.gripper, *self.further):
             if device is not None:
                 device.connect()
+        if self.gripper is not None:  # its fingers may be closed already
+            self._fingers_mm = check_state(self.gripper.range, self.gripper.state()).opening_mm
 
     def close(self) -> None:
         """Stop the arm, then close every device; safe to call more than once.

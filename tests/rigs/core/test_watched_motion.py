@@ -792,6 +792,19 @@ def test_fingers_are_opened_before_any_contact(motion: Callable[[Rig], None]) ->
     assert min(openings) == pytest.approx(rig.grip_opening_mm, abs=0.1)
 
 
+def test_fingers_that_were_closed_before_connecting_count_in_the_depth() -> None:
+    """A grip, a crash or a person closed them: the first move is checked with it."""
+    rig = make_rig("mock-gripper", None)
+    gripper = rig.gripper
+    gripper.move(rig.grip_opening_mm - 3.0, 20.0, 50.0)
+    while gripper.state().moving:
+        rig.clock.wait(0.05)
+    rig.connect()
+    with pytest.raises(DepthError, match=r"depth in contact 5\.4 mm is beyond its limit"):
+        rig.move(Move("press", DEEP, 2.0), rig.position())
+    assert rig.position().depth_mm < 0.0
+
+
 @pytest.mark.parametrize(
     ("state", "said"),
     [
