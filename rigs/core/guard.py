@@ -19,6 +19,8 @@ from sliplab.rigs.core.pose import angle_deg
 _EPS = 1e-6
 MEASURED_MM = 0.2
 """Largest distance of a measured pose beyond a limit: repeatability and noise of arms."""
+LOOK_MM = 0.05
+"""Largest difference of two looks at the pose of an arm at rest."""
 MEASURED_DEG = 1.0
 """Largest measured turn of the tool beyond its limit."""
 
@@ -78,18 +80,34 @@ class PlateLimits:
 
 @dataclass(frozen=True)
 class _Coordinate:
-    """A limited coordinate of a pose, mm."""
+    """A limited coordinate of a pose, mm.
+
+    Attributes:
+        place: in its direction: of a distance from a centre, where that is measured.
+    """
 
     error: type[GuardError]
     what: str
     value: float
     low: float
     high: float
+    place: tuple[float, float] | None = None
 
     @property
     def excess(self) -> float:
         """Distance beyond the limits, mm; negative inside, NaN for an invalid value."""
         return max(self.low - self.value, self.value - self.high)
+
+    def allowed(self, before: _Coordinate) -> float:
+        """Return the largest excess on a way that began at `before`, mm: no more than there.
+
+        None beyond the opposite limit: the way there leads through all that the limits protect.
+        """
+        if self.place is not None and before.place is not None:
+            same = self.place[0] * before.place[0] + self.place[1] * before.place[1] > 0.0
+        else:
+            same = (self.value < self.low) == (before.value < before.low)
+        return max(before.excess, 0.0) if same else 0.0
 
     def fault(self, where: str) -> GuardError:
         limit = self.low if self.value < self.low else self.high
@@ -135,7 +153,8 @@ class Guard:
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:
         """Check a path that starts at `begin` against the arm's limits.
 
-        `begin` itself may be outside: an arm that was jogged there must be able to return.
+        `begin` itself may be outside: an arm that was jogged there must be able to return. Where
+        the plate is only the rig knows, which checks the way; here it may lead no farther outside.
 
         Raises:
             GuardError: the first violation, with its value and its limit.
@@ -148,7 +167,7 @@ class Guard:
     ) -> None:
         """Check a segment against all limits, in the frame that the rig uses.
 
-        A segment from outside may end outside, if no farther than it began.
+        A segment from outside must end inside, or lead straight out of the plate.
 
         Args:
             closed_mm: what the fingers add to the depth.
@@ -169,9 +188,15 @@ class Guard:
             if not all(map(math.isfinite, numbers)):
                 raise RigError("arm", f"{where} contains a number that is not finite")
             self._speed(segment, where)
-            before = [] if plate is None else list(self._places(begin, plate, closed_mm))
-            for number, place in enumerate(self._places(segment.to, plate, closed_mm)):
-                allowed = max(before[number].excess, 0.0) if before else 0.0
+            straight = plate is None or _is_straight_out(begin, segment.to, plate)
+            before = self._places(begin, plate, closed_mm)
+            after = self._places(segment.to, plate, closed_mm)
+            for began, place in zip(before, after, strict=True):
+                allowed = place.allowed(began)
+                if not straight:
+                    allowed = min(allowed, MEASURED_MM)
+                elif began.excess > -LOOK_MM:  # the end is where an earlier look saw the arm
+                    allowed += LOOK_MM
                 if not place.excess <= allowed + _EPS:
                     raise place.fault(where)
             turn = angle_deg(at, segment.to)
@@ -203,7 +228,7 @@ class Guard:
             if place.excess <= MEASURED_MM:
                 continue
             before = before or list(self._places(begin, plate, closed_mm))
-            if not place.excess <= max(before[number].excess, 0.0) + MEASURED_MM:
+            if not place.excess <= place.allowed(before[number]) + MEASURED_MM:
                 raise place.fault(where)
         if self._limits is None or pose.rotvec_deg == begin.rotvec_deg:
             return
@@ -274,4 +299,12 @@ class Guard:
             yield _Coordinate(DepthError, "depth in contact", depth, -math.inf, own.depth_mm)
             reach = math.hypot(here.x_mm, here.y_mm)
             name = "distance from the plate's centre"
-            yield _Coordinate(WorkspaceError, name, reach, -math.inf, own.reach_mm)
+            place = here.x_mm, here.y_mm
+            yield _Coordinate(WorkspaceError, name, reach, -math.inf, own.reach_mm, place)
+
+
+def _is_straight_out(begin: Pose, end: Pose, plate: PlateFrame) -> bool:
+    """Return whether a move leads away from the plate along its normal."""
+    one, other = plate.position(begin.xyz_mm), plate.position(end.xyz_mm)
+    sideways_mm = math.hypot(other.x_mm - one.x_mm, other.y_mm - one.y_mm)
+    return other.depth_mm < one.depth_mm and sideways_mm <= LOOK_MM
