@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.core.pose import angle_deg
+from sliplab.rigs.core.pose import angle_deg, distance_mm
 
 _EPS = 1e-6
 MEASURED_MM = 0.2
@@ -146,7 +146,7 @@ class Guard:
 
     @property
     def turn_deg_s(self) -> float:
-        """Largest speed of a turn on the spot, by that of the sensor's rim."""
+        """Largest speed of a turn, on the spot or in a move, by that of the sensor's rim."""
         own = self._plate_limits
         return math.degrees(own.speed_mm_s / own.rim_mm) if own and own.rim_mm else math.inf
 
@@ -187,7 +187,8 @@ class Guard:
             numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, segment.speed_mm_s)
             if not all(map(math.isfinite, numbers)):
                 raise RigError("arm", f"{where} contains a number that is not finite")
-            self._speed(segment, where)
+            turn = angle_deg(at, segment.to)
+            self._speed(at, segment, turn, where)
             straight = plate is None or _is_straight_out(begin, segment.to, plate)
             before = self._places(begin, plate, closed_mm)
             after = self._places(segment.to, plate, closed_mm)
@@ -199,7 +200,6 @@ class Guard:
                     allowed += LOOK_MM
                 if not place.excess <= allowed + _EPS:
                     raise place.fault(where)
-            turn = angle_deg(at, segment.to)
             most = math.inf if self._limits is None else self._limits.tilt_deg
             if not turn <= most + _EPS:
                 raise TiltError("turn of the tool", turn, most, "deg", where)
@@ -261,12 +261,13 @@ class Guard:
                 "joint 5, off its singular position by", off, limit, "deg", "joints now"
             )
 
-    def _speed(self, segment: Segment, where: str) -> None:
+    def _speed(self, at: Pose, segment: Segment, angle: float, where: str) -> None:
         limit = self.speed_mm_s
         if not 0 < segment.speed_mm_s <= limit + _EPS:
             raise SpeedError("speed", segment.speed_mm_s, limit, "mm/s", where)
         turn = segment.turn_deg_s
         if turn is None:
+            self._turn_in_move(distance_mm(at, segment.to), segment.speed_mm_s, angle, where)
             return
         if not 0 < turn < math.inf:
             raise RigError("arm", f"{where} turns at {turn} deg/s")
@@ -275,6 +276,15 @@ class Guard:
             if not rim <= self._plate_limits.speed_mm_s + _EPS:
                 name = f"speed of the sensor's rim at {turn:g} deg/s:"
                 raise SpeedError(name, rim, self._plate_limits.speed_mm_s, "mm/s", where)
+
+    def _turn_in_move(self, way_mm: float, speed_mm_s: float, angle: float, where: str) -> None:
+        """Check how fast the tool turns in a move: a controller turns it while it moves, at once
+        if the way is short. `MEASURED_DEG` may be the difference of two looks."""
+        most, seconds = self.turn_deg_s, way_mm / speed_mm_s
+        if angle <= MEASURED_DEG or most == math.inf or angle <= most * seconds + _EPS:
+            return
+        name = f"speed of the turn by {angle:.3g} deg in a move of {way_mm:.2g} mm:"
+        raise SpeedError(name, angle / seconds if seconds else math.inf, most, "deg/s", where)
 
     def _places(
         self, pose: Pose, plate: PlateFrame | None, closed_mm: float

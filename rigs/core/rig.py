@@ -692,7 +692,7 @@ class Rig:
             start and end, controller times in ns, and True where it was stopped on the way.
         """
         start = self.arm.now_ns()
-        if seconds == 0:
+        if seconds == 0 and is_near(self.pose(), segment.to):  # not where the tool leans
             return start, start, False
         with self.moving(segment):
             deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
@@ -1037,7 +1037,8 @@ class Rig:
             if at.distance_mm(out) == 0:
                 return None
             pose, speed_mm_s = self.plate_frame.pose(out), self.at_most(RETRACT_SPEED_MM_S)
-            if self._twisted:  # straight out with its present rotation; it turns back once clear
+            # straight out with its present rotation, or its rim turns in contact; back once clear
+            if self._twisted or angle_deg(begin, pose) > _TURN_DEG:
                 pose = replace(pose, rotvec_deg=begin.rotvec_deg)
             blind = _of_sensor(error) and not isinstance(error, ForceLimitError)
             if self.force is not None and self._watches_closely and not blind:

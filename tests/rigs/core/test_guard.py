@@ -102,6 +102,26 @@ def test_limits_of_the_rig_count_in_the_frame_it_uses() -> None:
     assert held.speed_mm_s == 20.0
 
 
+def test_a_move_may_not_turn_the_tool_faster_than_a_turn_on_the_spot() -> None:
+    """A controller turns the tool while it moves: at once, if the way is short."""
+    held = Guard(None, PlateLimits(3.0, 10.0, speed_mm_s=20.0, rim_mm=10.0))
+
+    def turns(angle: float, way_mm: float) -> Segment:
+        return Segment(FRAME.pose(Position(0, 0, -5 - way_mm, twist_deg=angle)), 10.0)
+
+    begin = at(0, 0, -5)
+    held.check_segment(begin, turns(28.0, 2.5), FRAME)  # 112 of 114.6 deg/s
+    held.check_segment(begin, turns(0.9, 0.0), FRAME)  # as poses scatter
+    with pytest.raises(
+        SpeedError, match=r"turn by 28 deg .* 2\.4 mm: 116\.7 deg/s .* 114\.6 deg/s"
+    ):
+        held.check_segment(begin, turns(28.0, 2.4), FRAME)
+    for angle, way_mm in ((28.0, 0.0), (1.5, 0.01)):
+        with pytest.raises(SpeedError, match="speed of the turn"):
+            held.check_segment(begin, turns(angle, way_mm), FRAME)
+    Guard(ArmLimits(**BOX)).check_segment(begin, turns(28.0, 0.1), FRAME)  # of an unknown rim
+
+
 def test_path_straight_out_may_end_no_farther_outside() -> None:
     held = Guard(None, PlateLimits(3.0, 10.0, 20.0))
     begin = at(14, 0, 4)

@@ -565,6 +565,43 @@ def test_turn_faster_than_the_limit_is_stopped_by_its_poses() -> None:
         rig.twist(Twist("twist", replace(HOME, twist_deg=90.0), 20.0), HOME)
 
 
+def test_turn_in_a_move_is_stopped_by_its_poses_too() -> None:
+    rig = home_rig()
+    rig.guard = Guard(None, replace_limits(rig, speed_mm_s=20.0))
+    rig.guard._plate_limits = replace_limits(rig, depth_mm=99.0)
+    began = rig.clock.now_ns()
+
+    def lie(pose: Pose) -> Pose:
+        turn_deg = (rig.clock.now_ns() - began) * 120e-9
+        return Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, turn_deg))
+
+    with_arm(rig, lie)
+    with pytest.raises(SpeedError, match=r"turn 120 deg/s is beyond its limit 86\.8\d? deg/s"):
+        rig.move(Move("slide", Position(9.0, 0.0, -2.0), 5.0), HOME)
+
+
+def test_way_out_keeps_the_rotation_that_the_tool_has() -> None:
+    """It would turn its rim in contact."""
+    rig = home_rig()
+    rig.move(Move("press", DEEP, 10.0), HOME)
+    arm = with_arm(rig, lambda pose: Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, 10.0)))
+    leaning = rig.pose().rotvec_deg
+    with pytest.raises(RigError, match="a fault"), rig.safely(HOME):
+        raise RigError("force sensor", "a fault")
+    (out,) = arm.started
+    assert out.to.rotvec_deg == leaning
+    assert rig.position().depth_mm < 0.0
+
+
+def test_a_tool_that_leans_is_not_at_its_place() -> None:
+    """A move without a way is made all the same, or the next one would turn the tool in contact."""
+    rig = home_rig()
+    arm = with_arm(rig, lambda pose: Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, 10.0)))
+    with pytest.raises(SpeedError, match="speed of the turn by 10 deg in a move of 0 mm"):
+        rig.move(Move("home", rig.position(), 10.0), rig.position())
+    assert not arm.started
+
+
 def replace_limits(rig: Rig, **change: float) -> Any:
     return replace(rig.guard._plate_limits, **change)  # type: ignore[type-var]
 
