@@ -109,6 +109,10 @@ class FrameCameraSpec(StrictModel):
     """Write raw frames and encode them after the trial, where live encoding is too slow."""
 
 
+LONGEST_TIMEOUT_S = 5
+"""Longest timeout of a reflex: with a longer one a sense that is lost would be none."""
+
+
 class ReflexSettings(StrictModel):
     """What a reflex does when slip can no longer be detected (docs/reflex.md)."""
 
@@ -120,9 +124,16 @@ class ReflexSettings(StrictModel):
     """Force at which closing fingers stall, in reflexes and in the safe state; left out, the least
     that the gripper can be set to."""
     stream_timeout: PositiveSeconds = Decimal("0.2")
-    """Longest time without an event or a pulse of the event camera."""
+    """Longest time without an event or a pulse of the event camera; at most 5 s."""
     decision_timeout: PositiveSeconds = Decimal("0.1")
-    """Longest time from reading events to the decision on them."""
+    """Longest time from reading events to the decision on them; at most 5 s."""
+
+    @rule
+    def _senses_are_missed_soon(self) -> Iterator[KeyedError]:
+        for name in ("stream_timeout", "decision_timeout"):
+            if (seconds := getattr(self, name)) > LONGEST_TIMEOUT_S:
+                text = f"must be at most {LONGEST_TIMEOUT_S} s, or a lost sense goes unnoticed"
+                yield KeyedError(f".{name}", f"{seconds} s", text)
 
 
 class RigFile(StrictModel):

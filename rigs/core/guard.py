@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from sliplab.rigs.core.arm_settings import ArmLimits
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
-from sliplab.rigs.core.pose import angle_deg
+from sliplab.rigs.core.pose import angle_deg, distance_mm
 
 _EPS = 1e-6
 MEASURED_MM = 0.2
 """Largest distance of a measured pose beyond a limit: repeatability and noise of arms."""
+LOOK_MM = 0.05
+"""Largest difference of two looks at the pose of an arm at rest."""
 MEASURED_DEG = 1.0
 """Largest measured turn of the tool beyond its limit."""
 
@@ -78,18 +80,34 @@ class PlateLimits:
 
 @dataclass(frozen=True)
 class _Coordinate:
-    """A limited coordinate of a pose, mm."""
+    """A limited coordinate of a pose, mm.
+
+    Attributes:
+        place: in its direction: of a distance from a centre, where that is measured.
+    """
 
     error: type[GuardError]
     what: str
     value: float
     low: float
     high: float
+    place: tuple[float, float] | None = None
 
     @property
     def excess(self) -> float:
         """Distance beyond the limits, mm; negative inside, NaN for an invalid value."""
         return max(self.low - self.value, self.value - self.high)
+
+    def allowed(self, before: _Coordinate) -> float:
+        """Return the largest excess on a way that began at `before`, mm: no more than there.
+
+        None beyond the opposite limit: the way there leads through all that the limits protect.
+        """
+        if self.place is not None and before.place is not None:
+            same = self.place[0] * before.place[0] + self.place[1] * before.place[1] > 0.0
+        else:
+            same = (self.value < self.low) == (before.value < before.low)
+        return max(before.excess, 0.0) if same else 0.0
 
     def fault(self, where: str) -> GuardError:
         limit = self.low if self.value < self.low else self.high
@@ -128,14 +146,15 @@ class Guard:
 
     @property
     def turn_deg_s(self) -> float:
-        """Largest speed of a turn on the spot, by that of the sensor's rim."""
+        """Largest speed of a turn, on the spot or in a move, by that of the sensor's rim."""
         own = self._plate_limits
         return math.degrees(own.speed_mm_s / own.rim_mm) if own and own.rim_mm else math.inf
 
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:
         """Check a path that starts at `begin` against the arm's limits.
 
-        `begin` itself may be outside: an arm that was jogged there must be able to return.
+        `begin` itself may be outside: an arm that was jogged there must be able to return. Where
+        the plate is only the rig knows, which checks the way; here it may lead no farther outside.
 
         Raises:
             GuardError: the first violation, with its value and its limit.
@@ -148,7 +167,7 @@ class Guard:
     ) -> None:
         """Check a segment against all limits, in the frame that the rig uses.
 
-        A segment from outside may end outside, if no farther than it began.
+        A segment from outside must end inside, or lead straight out of the plate.
 
         Args:
             closed_mm: what the fingers add to the depth.
@@ -168,13 +187,19 @@ class Guard:
             numbers = (*segment.to.xyz_mm, *segment.to.rotvec_deg, segment.speed_mm_s)
             if not all(map(math.isfinite, numbers)):
                 raise RigError("arm", f"{where} contains a number that is not finite")
-            self._speed(segment, where)
-            before = [] if plate is None else list(self._places(begin, plate, closed_mm))
-            for number, place in enumerate(self._places(segment.to, plate, closed_mm)):
-                allowed = max(before[number].excess, 0.0) if before else 0.0
+            turn = angle_deg(at, segment.to)
+            self._speed(at, segment, turn, where)
+            straight = plate is None or _is_straight_out(begin, segment.to, plate)
+            before = self._places(begin, plate, closed_mm)
+            after = self._places(segment.to, plate, closed_mm)
+            for began, place in zip(before, after, strict=True):
+                allowed = place.allowed(began)
+                if not straight:
+                    allowed = min(allowed, MEASURED_MM)
+                elif began.excess > -LOOK_MM:  # the end is where an earlier look saw the arm
+                    allowed += LOOK_MM
                 if not place.excess <= allowed + _EPS:
                     raise place.fault(where)
-            turn = angle_deg(at, segment.to)
             most = math.inf if self._limits is None else self._limits.tilt_deg
             if not turn <= most + _EPS:
                 raise TiltError("turn of the tool", turn, most, "deg", where)
@@ -203,7 +228,7 @@ class Guard:
             if place.excess <= MEASURED_MM:
                 continue
             before = before or list(self._places(begin, plate, closed_mm))
-            if not place.excess <= max(before[number].excess, 0.0) + MEASURED_MM:
+            if not place.excess <= place.allowed(before[number]) + MEASURED_MM:
                 raise place.fault(where)
         if self._limits is None or pose.rotvec_deg == begin.rotvec_deg:
             return
@@ -236,12 +261,13 @@ class Guard:
                 "joint 5, off its singular position by", off, limit, "deg", "joints now"
             )
 
-    def _speed(self, segment: Segment, where: str) -> None:
+    def _speed(self, at: Pose, segment: Segment, angle: float, where: str) -> None:
         limit = self.speed_mm_s
         if not 0 < segment.speed_mm_s <= limit + _EPS:
             raise SpeedError("speed", segment.speed_mm_s, limit, "mm/s", where)
         turn = segment.turn_deg_s
         if turn is None:
+            self._turn_in_move(distance_mm(at, segment.to), segment.speed_mm_s, angle, where)
             return
         if not 0 < turn < math.inf:
             raise RigError("arm", f"{where} turns at {turn} deg/s")
@@ -250,6 +276,15 @@ class Guard:
             if not rim <= self._plate_limits.speed_mm_s + _EPS:
                 name = f"speed of the sensor's rim at {turn:g} deg/s:"
                 raise SpeedError(name, rim, self._plate_limits.speed_mm_s, "mm/s", where)
+
+    def _turn_in_move(self, way_mm: float, speed_mm_s: float, angle: float, where: str) -> None:
+        """Check how fast the tool turns in a move: a controller turns it while it moves, at once
+        if the way is short. `MEASURED_DEG` may be the difference of two looks."""
+        most, seconds = self.turn_deg_s, way_mm / speed_mm_s
+        if angle <= MEASURED_DEG or most == math.inf or angle <= most * seconds + _EPS:
+            return
+        name = f"speed of the turn by {angle:.3g} deg in a move of {way_mm:.2g} mm:"
+        raise SpeedError(name, angle / seconds if seconds else math.inf, most, "deg/s", where)
 
     def _places(
         self, pose: Pose, plate: PlateFrame | None, closed_mm: float
@@ -274,4 +309,12 @@ class Guard:
             yield _Coordinate(DepthError, "depth in contact", depth, -math.inf, own.depth_mm)
             reach = math.hypot(here.x_mm, here.y_mm)
             name = "distance from the plate's centre"
-            yield _Coordinate(WorkspaceError, name, reach, -math.inf, own.reach_mm)
+            place = here.x_mm, here.y_mm
+            yield _Coordinate(WorkspaceError, name, reach, -math.inf, own.reach_mm, place)
+
+
+def _is_straight_out(begin: Pose, end: Pose, plate: PlateFrame) -> bool:
+    """Return whether a move leads away from the plate along its normal."""
+    one, other = plate.position(begin.xyz_mm), plate.position(end.xyz_mm)
+    sideways_mm = math.hypot(other.x_mm - one.x_mm, other.y_mm - one.y_mm)
+    return other.depth_mm < one.depth_mm and sideways_mm <= LOOK_MM

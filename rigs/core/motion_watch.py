@@ -114,14 +114,13 @@ class MotionWatch:
             self._past = asked_ns, pose
 
     def _check_speed(self, pose: Pose) -> None:
-        """Hold the mean speed since an earlier pose, of a turn on the spot too, to its limit."""
+        """Hold the mean speeds since an earlier pose, of the way and of the turn, to the limits."""
         limit, (past_ns, past) = self._guard.speed_mm_s, self._past
         seconds = max(self._now_ns() - past_ns, 1) * 1e-9
         gone_mm = distance_mm(past, pose)
         where = "the arm was stopped on its way, and stays where it is"
         if not gone_mm <= (1.0 + SPEED_SHARE) * limit * seconds + SPEED_MM:
             raise MeasuredSpeedError("speed", gone_mm / seconds, limit, "mm/s", where)
-        if self._segment.turn_deg_s is not None:
-            turn_deg, most = angle_deg(past, pose), self._guard.turn_deg_s
-            if not turn_deg <= (1.0 + SPEED_SHARE) * most * seconds + SPEED_DEG:
-                raise MeasuredSpeedError("turn", turn_deg / seconds, most, "deg/s", where)
+        turn_deg, most = angle_deg(past, pose), self._guard.turn_deg_s
+        if not turn_deg <= (1.0 + SPEED_SHARE) * most * seconds + SPEED_DEG:
+            raise MeasuredSpeedError("turn", turn_deg / seconds, most, "deg/s", where)

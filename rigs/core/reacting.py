@@ -17,7 +17,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-from sliplab.protocols.program import ACTING, Move, Position, Program, Step
+from sliplab.protocols.program import ACTING, Move, Position, Program, Step, Twist
 from sliplab.rigs.core.capabilities import ArmFault, RigError, StaysInContact
 from sliplab.rigs.core.force_watch import PressPlaces
 from sliplab.rigs.core.rig import Rig, arm_fault, nuisances_of
@@ -114,7 +114,7 @@ class Reaction:
             a driver's way to its device is in it.
         stopped_mm: position at which it came to rest: x, y, depth in plate coordinates.
         depth_mm: final depth in contact: the arm's, and what the fingers add.
-        closed_mm: by how much the fingers closed.
+        closed_mm: by how much the fingers are closed, with what an earlier grip closed.
         stalled: they ended at their force.
         evidence: times of the detection, where the watcher measures them.
     """
@@ -162,8 +162,9 @@ def run_watched(
 ) -> Reaction | None:
     """Run a program while `watcher` reads the streams of its recorded steps.
 
-    After a reflex the arm leaves the plate straight out from its current position, and the rest of
-    the program follows.
+    After a reflex no motion along the plate or into it is made: the arm leaves the plate straight
+    out from its current position, by the next retract or release, and the rest of the program
+    follows.
 
     Args:
         seed: seed of a simulated trial's randomness.
@@ -180,6 +181,7 @@ def run_watched(
         RigError: anything failed; the arm is stopped.
     """
     reaction: Reaction | None = None
+    holding = False  # since a reflex, until the arm is clear
     with rig.safely(program.home):
         rig.begin_trial(program.home, seed, nuisances_of(program))
         course, streaming = PressPlaces(program.home), False
@@ -193,7 +195,10 @@ def run_watched(
                 rig.stop_streams(watcher)
                 streaming = False
             if reaction is not None:
-                step = _from_current_position(step, course.at)
+                left = _after_reflex(step, course.at, holding)
+                if left is None:
+                    continue
+                step = left
             acting = isinstance(step, Move) and step.phase in ACTING and reflex is not None
             watcher.step(step.phase, acting)
             watcher.armed = acting
@@ -212,8 +217,10 @@ def run_watched(
                 watcher.armed = False
             if made is None:
                 course.taken(step, rig.position)
+                holding = holding and course.at.depth_mm + rig._closed_mm > 0.0
             else:
-                reaction, course.at = made, rig.position()
+                reaction, holding = made, True
+                course.at = replace(rig.position(), twist_deg=course.at.twist_deg)
     return reaction
 
 
@@ -233,7 +240,7 @@ def _take(
     except SlipDetected as slip:
         assert reflex is not None
         watcher.guarded = safe is not None  # without one nothing depends on slip from here on
-        made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence)
+        made = _react(rig, step.phase, reflex, watcher, watcher, slip.evidence, at.twist_deg)
         rig.wait(reflex.hold_s, watcher)
         return made
     return None
@@ -258,15 +265,20 @@ def _react(
     watcher: Watcher,
     sink: Sink | None,
     evidence: DetectionTimes | None,
+    twist_deg: float = 0.0,
 ) -> Reaction:
-    """Carry out a reflex; streams are read meanwhile where they have a sink."""
+    """Carry out a reflex; streams are read meanwhile where they have a sink.
+
+    Args:
+        twist_deg: rotation of the sensor, which a press keeps.
+    """
     began_ns = rig.clock.now_ns()
 
     def passed_ms() -> float:
         return (rig.clock.now_ns() - began_ns) / 1e6
 
     watcher.armed = False
-    closed_mm = 0.0
+    closed_mm = rig._closed_mm
     try:
         if reflex.kind == "grip" and phase in _LEVEL:
             closed_mm = _grip(rig, reflex)
@@ -288,13 +300,18 @@ def _react(
     stalled = False
     if reflex.kind == "press":
         # measured depths scatter about the command; the limit applies all the same
-        depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm)
+        depth = min(here.depth_mm + reflex.deeper_mm, reflex.deepest_mm - closed_mm)
         if not depth <= here.depth_mm:  # a depth that is no number is refused by the rig
-            deep = Position(here.x_mm, here.y_mm, depth)
+            deep = Position(here.x_mm, here.y_mm, depth, twist_deg)
             rig.move(Move("reflex", deep, reflex.speed_mm_s), here, sink)
     if rig.gripper is not None and closed_mm:
-        state = rig.await_fingers(rig.gripper, sink)
-        closed_mm, stalled = rig.grip_opening_mm - state.opening_mm, state.stalled
+        try:
+            state = rig.await_fingers(rig.gripper, sink)
+            closed_mm, stalled = rig.grip_opening_mm - state.opening_mm, state.stalled
+        except RigError as fault:
+            # a stop lets an earlier grip end; a gripper that fails does not keep it from ending
+            if fault.device != GRIPPER or reflex.kind == "grip":
+                raise
     return Reaction(
         phase,
         stop_ms,
@@ -309,19 +326,40 @@ def _react(
 
 
 def _grip(rig: Rig, reflex: Reflex) -> float:
-    """Start to close the fingers, and return by how much, mm; not beyond the deepest place."""
+    """Start to close the fingers further, not beyond the deepest place, and never open them.
+
+    Returns:
+        by how much they are then closed in all, mm.
+    """
     if rig.gripper is None:
         raise RigError(GRIPPER, "this rig has none to tighten")
+    already_mm = rig._closed_mm  # by an earlier grip: less would drop what it holds
     room_mm = reflex.deepest_mm - rig.position().depth_mm
-    closed_mm = min(reflex.deeper_mm, room_mm)
-    if closed_mm <= 0:
-        return 0.0
+    closed_mm = min(already_mm + reflex.deeper_mm, room_mm)
+    if not closed_mm > already_mm:
+        return already_mm
     rig.move_fingers(rig.grip_opening_mm - closed_mm, reflex.speed_mm_s, reflex.force_n)
     return closed_mm
 
 
-def _from_current_position(step: Step, at: Position) -> Step:
-    """Adapt a step after a reflex: it was planned from the end of the interrupted motion."""
-    if isinstance(step, Move) and step.phase == "release":
-        return replace(step, to=Position(at.x_mm, at.y_mm, step.to.depth_mm))
-    return step
+def _after_reflex(step: Step, at: Position, holding: bool) -> Step | None:
+    """Adapt a step after a reflex: it was planned from the end of the interrupted motion.
+
+    Args:
+        holding: the arm has not left the plate since: it only moves straight out, for any other
+            motion would drag or press what the reflex holds.
+
+    Returns:
+        None for a step that is not made.
+    """
+    if not isinstance(step, Move | Twist):
+        return step
+    if isinstance(step, Twist):
+        on_the_spot = replace(step, to=replace(at, twist_deg=step.to.twist_deg))
+        return None if holding else on_the_spot
+    if not holding and step.phase != "release":
+        return step
+    leaves = step.phase in ("retract", "release") or step.to.depth_mm <= 0.0
+    if not leaves or step.to.depth_mm >= at.depth_mm:
+        return None
+    return replace(step, to=replace(at, depth_mm=step.to.depth_mm))

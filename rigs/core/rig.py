@@ -208,7 +208,7 @@ class Rig:
     _zeroed: bool = field(default=False, init=False)
     """The present load was taken for zero since the sensor was connected."""
     _fingers_mm: float | None = field(default=None, init=False)
-    """Opening to which the fingers were last sent; None before."""
+    """Opening to which the fingers were last sent, or that they had when connected."""
     _insisted: bool = field(default=False, init=False)
     """Ctrl-C came once more while the arm was being stopped: it does not retract."""
     _reported: str = field(default="", init=False)
@@ -263,6 +263,8 @@ class Rig:
         for device in (self.force, self.gripper, *self.further):
             if device is not None:
                 device.connect()
+        if self.gripper is not None:  # its fingers may be closed already
+            self._fingers_mm = check_state(self.gripper.range, self.gripper.state()).opening_mm
 
     def close(self) -> None:
         """Stop the arm, then close every device; safe to call more than once.
@@ -481,6 +483,7 @@ class Rig:
         with self.safely(home):
             out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
             self._come_clear(home)
+            self._turn_back(home)
             self.move(Move("home", home, out_mm_s), self.position(), None)
             self._open_fingers()
             if self._watches_closely:
@@ -927,11 +930,7 @@ class Rig:
         The sensor is clear of the plate there, so a force sensor is zeroed.
         """
         self._come_clear(home)
-        if self._twisted:  # an earlier trial ended in its twist
-            here = self.position()
-            left = angle_deg(self.pose(), self.plate_frame.pose(here))
-            self.twist(Twist("untwist", here, UNTWIST_DEG_S), replace(here, twist_deg=left))
-            self._twisted = False
+        self._turn_back(home)
         out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         self.move(Move("home", home, out_mm_s), self.position(), None)
         self.begin_clear(seed, nuisances)
@@ -951,6 +950,19 @@ class Rig:
         speed_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         segment = Segment(replace(out, rotvec_deg=begin.rotvec_deg), speed_mm_s)
         self._follow(segment, (at.depth_mm - home.depth_mm) / speed_mm_s, "come clear", None)
+
+    def _turn_back(self, home: Position) -> None:
+        """Turn a turned sensor back on the spot, where the way home is too short to do it there.
+
+        An earlier trial ended in its twist, or an earlier command was stopped in it.
+        """
+        here = self.position()
+        left = angle_deg(self.pose(), self.plate_frame.pose(here))
+        on_way = self.guard.turn_deg_s * here.distance_mm(home) / self.at_most(RETRACT_SPEED_MM_S)
+        if self._twisted or (here.depth_mm <= 0.0 and left > max(_TURN_DEG, on_way)):
+            speed_deg_s = min(UNTWIST_DEG_S, self.guard.turn_deg_s)
+            self.twist(Twist("untwist", here, speed_deg_s), replace(here, twist_deg=left))
+            self._twisted = False
 
     def begin_clear(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Open the fingers, let the simulation draw its random values, zero the force sensor.

@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 
 from sliplab.plugins.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
-from sliplab.plugins.devices.abb.program import PAUSE_S, motion_program
+from sliplab.plugins.devices.abb.program import PAUSE_S, TURN_DEG_S, motion_program
 from sliplab.plugins.devices.abb.rws import (
     FULL_SPEED_PERCENT,
     REQUEST_S,
@@ -47,7 +47,7 @@ from sliplab.rigs.core.capabilities import (
     Progress,
     Segment,
 )
-from sliplab.rigs.core.pose import compose, distance_mm, segment_seconds
+from sliplab.rigs.core.pose import angle_deg, compose, distance_mm, segment_seconds
 from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.core.threaded_arm import Run, SegmentWatch, ThreadedArm, has_left, is_at
 from sliplab.storage.streams import Json
@@ -642,10 +642,14 @@ class AbbArm(ThreadedArm):
     def _is_stale(self, sample: Sample) -> bool:
         return time.monotonic_ns() - sample.host_ns > SILENCE_S * 1e9
 
+    def _turn_s(self, begin: Pose, segment: Segment) -> float:
+        """Return the time that the controller takes for the turn in a segment, s."""
+        return angle_deg(begin, segment.to) / (segment.turn_deg_s or TURN_DEG_S)
+
     def _seconds(self, run: Run) -> list[float]:
         """Return the duration of each segment without its ramps, s."""
         places = [self._planned or run.path[0].to, *(segment.to for segment in run.path)]
         return [
-            segment_seconds(one, segment) + PAUSE_S
+            max(segment_seconds(one, segment), self._turn_s(one, segment)) + PAUSE_S
             for one, segment in zip(places, run.path, strict=False)
         ]

@@ -36,7 +36,14 @@ from sliplab.rigs.core.fakes import (
     Kind,
     Stage,
 )
-from sliplab.rigs.core.pose import compose, distance_mm, from_quaternion, inverse, quaternion
+from sliplab.rigs.core.pose import (
+    angle_deg,
+    compose,
+    distance_mm,
+    from_quaternion,
+    inverse,
+    quaternion,
+)
 
 FILE_VERSION = 10011
 _MOVE_L, _WAIT = 3, 5
@@ -353,8 +360,11 @@ class FakeAbb(FakeController):
             self._wait_until_s = t_s + command.seconds
             return
         self._left_from = self.motion.pose(t_s)
-        on_the_spot = distance_mm(self._left_from, command.to) < ON_THE_SPOT_MM
+        way_mm = distance_mm(self._left_from, command.to)
+        on_the_spot = way_mm < ON_THE_SPOT_MM
         speed = command.turn_deg_s if on_the_spot else command.speed_mm_s
+        if not on_the_spot and (angle := angle_deg(self._left_from, command.to)):
+            speed = min(speed, way_mm * command.turn_deg_s / angle)  # the longer time counts
         speed *= self.speed_percent / 100  # of a turn in deg/s, as the motion counts it
         self.motion.move(command.to, speed, ACCELERATION_MM_S2, t_s)
 

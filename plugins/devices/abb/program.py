@@ -21,7 +21,10 @@ from sliplab.rigs.core.pose import quaternion
 
 PAUSE_S = 0.05
 """Pause after each segment, so that its end can be detected, s."""
-_TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S = 500.0, 5000.0, 1000.0
+TURN_DEG_S = 20.0
+"""Largest speed at which the tool turns in a move. The controller takes the longer of the times of
+way and turn: a turn on a short way slows the move, instead of being made at once."""
+_LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S = 5000.0, 1000.0
 _NO_AXES = [0.0] * 6
 
 
@@ -39,7 +42,7 @@ def motion_program(
     for segment in path:
         place, turn = list(segment.to.xyz_mm), list(quaternion(segment.to))
         target = robtarget(place, turn, confdata(*configuration), _NO_AXES)
-        turn_deg_s = segment.turn_deg_s or _TURN_DEG_S
+        turn_deg_s = segment.turn_deg_s or TURN_DEG_S
         speed = speeddata(segment.speed_mm_s, turn_deg_s, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S)
         program.MoveL(target, speed, fine)
         program.WaitTime(PAUSE_S)

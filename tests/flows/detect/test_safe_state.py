@@ -313,6 +313,8 @@ def test_a_grip_ends_at_the_deepest_place(gripping: Gripping) -> None:
         ({"reflex": {"stream_timeout": "30 ms"}}, "must be over 32 ms, the camera's blocks"),
         ({"reflex": {"safe_state": "drop"}}, "reflex.safe_state.*'stop' or 'grip'"),
         ({"reflex": {"decision_timeout": 100}}, "reflex.decision_timeout.*has no unit"),
+        ({"reflex": {"decision_timeout": "5.1 s"}}, "reflex.decision_timeout = 5.1 s: must be at"),
+        ({"reflex": {"stream_timeout": "999999 s"}}, "reflex.stream_timeout.*must be at most 5 s"),
         ({"mock": {"gripper": {"opening_mm": 90}}}, "mock.gripper.opening_mm = 90"),
     ],
 )

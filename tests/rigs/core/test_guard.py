@@ -102,7 +102,27 @@ def test_limits_of_the_rig_count_in_the_frame_it_uses() -> None:
     assert held.speed_mm_s == 20.0
 
 
-def test_path_from_outside_may_end_no_farther_outside() -> None:
+def test_a_move_may_not_turn_the_tool_faster_than_a_turn_on_the_spot() -> None:
+    """A controller turns the tool while it moves: at once, if the way is short."""
+    held = Guard(None, PlateLimits(3.0, 10.0, speed_mm_s=20.0, rim_mm=10.0))
+
+    def turns(angle: float, way_mm: float) -> Segment:
+        return Segment(FRAME.pose(Position(0, 0, -5 - way_mm, twist_deg=angle)), 10.0)
+
+    begin = at(0, 0, -5)
+    held.check_segment(begin, turns(28.0, 2.5), FRAME)  # 112 of 114.6 deg/s
+    held.check_segment(begin, turns(0.9, 0.0), FRAME)  # as poses scatter
+    with pytest.raises(
+        SpeedError, match=r"turn by 28 deg .* 2\.4 mm: 116\.7 deg/s .* 114\.6 deg/s"
+    ):
+        held.check_segment(begin, turns(28.0, 2.4), FRAME)
+    for angle, way_mm in ((28.0, 0.0), (1.5, 0.01)):
+        with pytest.raises(SpeedError, match="speed of the turn"):
+            held.check_segment(begin, turns(angle, way_mm), FRAME)
+    Guard(ArmLimits(**BOX)).check_segment(begin, turns(28.0, 0.1), FRAME)  # of an unknown rim
+
+
+def test_path_straight_out_may_end_no_farther_outside() -> None:
     held = Guard(None, PlateLimits(3.0, 10.0, 20.0))
     begin = at(14, 0, 4)
     held.check_segment(begin, Segment(at(14, 0, -5), 5.0), FRAME)
@@ -110,6 +130,54 @@ def test_path_from_outside_may_end_no_farther_outside() -> None:
     for end in (at(14.1, 0, -5), at(0, 0, 4.1)):
         with pytest.raises(GuardError):
             held.check_segment(begin, Segment(end, 5.0), FRAME)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end"),
+    [
+        ((30, 0, -5), (-29, 0, -5)),  # over the whole plate
+        ((30, 0, -5), (0, 29, -5)),
+        ((30, 0, -5), (29, 0, -5)),
+        ((0, 0, 6), (9, 0, 5.9)),  # sideways, too deep
+        ((14, 0, 1), (14, 0, 2)),
+        ((0, 0, -35), (0, 0, 8)),  # from before the box through the plate
+        ((0, 0, 8), (0, 0, -31)),
+    ],
+)
+def test_path_from_outside_leads_inside_or_straight_out(begin: Any, end: Any) -> None:
+    box = ArmLimits(
+        low_mm=(-40, -40, -30),
+        high_mm=(40, 40, 7),
+        frame="plate",
+        plate=PLATE,  # type: ignore[arg-type]
+    )
+    held = Guard(box, PlateLimits(5.0, 10.0, 20.0))
+    with pytest.raises(GuardError):
+        held.check_segment(at(*begin), Segment(at(*end), 5.0), FRAME)
+    x, y, depth = begin
+    if depth > -30:
+        held.check_segment(at(x, y, depth), Segment(at(x + 0.02, y, depth - 1.5), 5.0), FRAME)
+    held.check_segment(at(x, y, depth), Segment(at(0, 0, -5), 5.0), FRAME)
+
+
+def test_way_out_at_a_place_outside_passes_the_drivers_check_too() -> None:
+    """A driver does not know the rig's plate, and must not hold an arm in it."""
+    outside = Pose((400.0, 50.3, 300.0), DOWN)
+    guard().check(outside, [to(380, 50.31, 300)])
+    for end in (to(380, 50.4, 300), to(380, -50.2, 300), to(299.9, 50.3, 300)):
+        with pytest.raises(WorkspaceError):
+            guard().check(outside, [end])
+
+
+def test_measured_pose_on_the_other_side_is_outside() -> None:
+    held = Guard(ArmLimits(**BOX), PlateLimits(3.0, 10.0, 20.0))
+    held.check_measured(at(14, 0, 0), at(14, 0, 0), FRAME)
+    for pose, begin in (
+        (at(-14, 0, 0), at(14, 0, 0)),
+        (Pose((450.0, 0.0, 195.0), DOWN), Pose((450.0, 0.0, 405.0), DOWN)),
+    ):
+        with pytest.raises(WorkspaceError, match="stopped on its way"):
+            held.check_measured(pose, begin, FRAME)
 
 
 def test_measured_poses_may_scatter_about_a_limit() -> None:

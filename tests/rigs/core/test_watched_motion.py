@@ -29,7 +29,8 @@ from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
 from sliplab.rigs.core.motion_watch import MeasuredSpeedError
 from sliplab.rigs.core.plate_frame import turned_about_z
-from sliplab.rigs.core.reacting import Reflex, SlipDetected, run_watched
+from sliplab.rigs.core.pose import angle_deg
+from sliplab.rigs.core.reacting import Reflex, SafeState, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
 from sliplab.rigs.rig_file import RigFile, load_rig_file
@@ -565,6 +566,52 @@ def test_turn_faster_than_the_limit_is_stopped_by_its_poses() -> None:
         rig.twist(Twist("twist", replace(HOME, twist_deg=90.0), 20.0), HOME)
 
 
+def test_turn_in_a_move_is_stopped_by_its_poses_too() -> None:
+    rig = home_rig()
+    rig.guard = Guard(None, replace_limits(rig, speed_mm_s=20.0))
+    rig.guard._plate_limits = replace_limits(rig, depth_mm=99.0)
+    began = rig.clock.now_ns()
+
+    def lie(pose: Pose) -> Pose:
+        turn_deg = (rig.clock.now_ns() - began) * 120e-9
+        return Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, turn_deg))
+
+    with_arm(rig, lie)
+    with pytest.raises(SpeedError, match=r"turn 120 deg/s is beyond its limit 86\.8\d? deg/s"):
+        rig.move(Move("slide", Position(9.0, 0.0, -2.0), 5.0), HOME)
+
+
+def test_way_out_keeps_the_rotation_that_the_tool_has() -> None:
+    """It would turn its rim in contact."""
+    rig = home_rig()
+    rig.move(Move("press", DEEP, 10.0), HOME)
+    arm = with_arm(rig, lambda pose: Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, 10.0)))
+    leaning = rig.pose().rotvec_deg
+    with pytest.raises(RigError, match="a fault"), rig.safely(HOME):
+        raise RigError("force sensor", "a fault")
+    (out,) = arm.started
+    assert out.to.rotvec_deg == leaning
+    assert rig.position().depth_mm < 0.0
+
+
+@pytest.mark.parametrize("motion", [trial, watched_trial, warm_up])
+@pytest.mark.parametrize("off_mm", [0.0, 0.5])
+def test_sensor_that_an_earlier_command_left_turned_turns_back(motion: Any, off_mm: float) -> None:
+    """It was stopped in a twist, and moved clear as turned as it was; this is another process."""
+    rig = home_rig()
+    there = replace(HOME, x_mm=off_mm, twist_deg=60.0)
+    rig.arm.start([Segment(rig.plate_frame.pose(replace(there, twist_deg=0.0)), 10.0)])
+    rig.clock.wait(2.0)
+    rig.arm.start([Segment(rig.plate_frame.pose(there), 10.0, 20.0)])
+    rig.clock.wait(5.0)
+    assert angle_deg(rig.pose(), rig.plate_frame.pose(HOME)) == pytest.approx(60.0, abs=0.5)
+    arm = with_arm(rig)
+    motion(rig)
+    assert arm.started[0].turn_deg_s == 20.0
+    assert arm.started[0].to.xyz_mm == pytest.approx(rig.plate_frame.pose(there).xyz_mm, abs=0.1)
+    assert not any(segment.turn_deg_s for segment in arm.started[1:])
+
+
 def replace_limits(rig: Rig, **change: float) -> Any:
     return replace(rig.guard._plate_limits, **change)  # type: ignore[type-var]
 
@@ -792,6 +839,19 @@ def test_fingers_are_opened_before_any_contact(motion: Callable[[Rig], None]) ->
     assert min(openings) == pytest.approx(rig.grip_opening_mm, abs=0.1)
 
 
+def test_fingers_that_were_closed_before_connecting_count_in_the_depth() -> None:
+    """A grip, a crash or a person closed them: the first move is checked with it."""
+    rig = make_rig("mock-gripper", None)
+    gripper = rig.gripper
+    gripper.move(rig.grip_opening_mm - 3.0, 20.0, 50.0)
+    while gripper.state().moving:
+        rig.clock.wait(0.05)
+    rig.connect()
+    with pytest.raises(DepthError, match=r"depth in contact 5\.4 mm is beyond its limit"):
+        rig.move(Move("press", DEEP, 2.0), rig.position())
+    assert rig.position().depth_mm < 0.0
+
+
 @pytest.mark.parametrize(
     ("state", "said"),
     [
@@ -820,6 +880,129 @@ def test_reflex_press_stops_at_the_rigs_limit_of_depth() -> None:
         run_watched(rig, PROGRAM, Watcher(slip=True), 1, 100, Reflex("press", 9.0, 3.0, 2.0))
     deepest = max(rig.plate_frame.position(s.to.xyz_mm).depth_mm for s in arm.started)
     assert deepest == pytest.approx(2.4)
+
+
+class LostAfterReflex(Watcher):
+    """A watcher that says slip, and can detect no more while the arm then rests."""
+
+    def __init__(self) -> None:
+        super().__init__(slip=True)
+        self._phase = ""
+
+    def step(self, phase: str, acting: bool) -> None:
+        self._phase = phase
+
+    def add(self, device: str, chunk: Chunk) -> None:
+        super().add(device, chunk)
+        if self._phase == "reflex" and not self.armed and self.guarded:
+            raise SenseLost("event camera: silent")
+
+
+@pytest.mark.parametrize(
+    ("kind", "deepest_mm", "closed_mm"),
+    [("grip", 4.0, 1.0), ("grip", 3.3, 0.9), ("grip", 3.2, 0.8), ("stop", 4.0, 0.8)],
+)
+def test_safe_state_after_a_grip_never_opens_the_fingers(
+    kind: Any, deepest_mm: float, closed_mm: float
+) -> None:
+    """The grip of a reflex holds the object: the safe state closes further, up to the depth."""
+    rig = make_rig("mock-gripper", None)
+    wanted = Reflex("grip", 4.0, 0.8, 20.0, 50.0, 0.2)
+    sent: list[float] = []
+    move = rig.gripper.move
+
+    def noted(opening_mm: float, *rest: float) -> None:
+        sent.append(opening_mm)
+        move(opening_mm, *rest)
+
+    put(rig.gripper, "move", noted)
+    with pytest.raises(SafeState) as safe:
+        run_watched(
+            rig,
+            PROGRAM,
+            LostAfterReflex(),
+            1,
+            100,
+            wanted,
+            Reflex(kind, deepest_mm, 0.2, 20.0, 50.0),
+        )
+    assert sent == sorted(sent, reverse=True)
+    assert rig.gripper.state().opening_mm == pytest.approx(40.0 - closed_mm, abs=0.02)
+    made = safe.value.reaction
+    assert made.closed_mm == pytest.approx(closed_mm, abs=0.02)
+    assert made.depth_mm == pytest.approx(2.4 + closed_mm, abs=0.03)
+
+
+def after_reflex(kind: Any, steps: tuple[Any, ...]) -> tuple[Rig, list[Segment]]:
+    """A rig and what its arm was sent after a reflex in the first motion in contact."""
+    rig = make_rig("mock-gripper", None)
+    rig.poll_s = 0.02
+    watcher, sent = Watcher(slip=True), []
+    arm = with_arm(rig)
+
+    def step(phase: str, acting: bool) -> None:
+        if phase == "reflex" and not sent:
+            sent.append(len(arm.started))
+            watcher._slip = False
+
+    put(watcher, "step", step)
+    reflex = Reflex(kind, 4.0, 0.3, 20.0 if kind == "grip" else 2.0, 50.0, 0.1)
+    assert run_watched(rig, Program(HOME, steps), watcher, 1, 100, reflex) is not None
+    return rig, arm.started[sent[0] + (kind == "press") :]
+
+
+@pytest.mark.parametrize("kind", ["stop", "press", "grip"])
+@pytest.mark.parametrize("leaving", ["release", "retract"])
+def test_after_a_reflex_the_arm_only_leaves_straight_out(kind: Any, leaving: str) -> None:
+    """What was planned in contact would drag what is held, or press it deeper."""
+    turned = Position(0.0, 0.0, 3.2, twist_deg=20.0)
+    out = Position(2.0, 0.0, -0.5)
+    rig, sent = after_reflex(
+        kind,
+        (
+            *PROGRAM.steps[:3],
+            Move("slide", Position(0.0, 0.0, 3.2), 3.0, recorded=True),
+            Twist("twist", turned, 20.0, recorded=True),
+            Dwell("hold", 0.1, recorded=True),
+            *([Move("retract", out, 10.0, recorded=True)] if leaving == "retract" else []),
+            Move("release", HOME, 10.0),
+            Move("return", HOME, 10.0),
+        ),
+    )
+    places = [rig.plate_frame.position(segment.to.xyz_mm) for segment in sent]
+    depths_mm = [place.depth_mm for place in places]
+    straight = [-0.5, -2.0, -2.0] if leaving == "retract" else [-2.0, -2.0]
+    assert depths_mm == pytest.approx(straight, abs=1e-6)
+    assert all(0.0 < place.x_mm < 0.5 for place in places[:-1])  # the slide was to 3 mm
+    assert len({round(place.x_mm, 9) for place in places[:-1]}) == 1
+    assert places[-1].x_mm == pytest.approx(0.0)
+    assert [segment.turn_deg_s for segment in sent] == [None] * len(sent)
+    assert rig.position().depth_mm == pytest.approx(-2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["stop", "press"])
+def test_after_a_reflex_a_turned_sensor_turns_back_once_clear(kind: Any) -> None:
+    turned = replace(DEEP, twist_deg=20.0)
+    away = replace(turned, x_mm=3.0)
+    rig, sent = after_reflex(
+        kind,
+        (
+            PROGRAM.steps[0],
+            Dwell("hold", 0.1, recorded=True),
+            Twist("twist", turned, 20.0, recorded=True),
+            Move("move", away, 3.0, recorded=True),
+            Move("release", replace(away, depth_mm=-2.0), 10.0),
+            Twist("untwist", Position(3.0, 0.0, -2.0), 20.0),
+            Move("return", HOME, 10.0),
+        ),
+    )
+    release, untwist, back = sent
+    straight = rig.plate_frame.pose(HOME).rotvec_deg
+    assert release.to.rotvec_deg == turned_about_z(straight, 20.0)
+    assert untwist.to.xyz_mm == release.to.xyz_mm
+    assert untwist.turn_deg_s == 20.0
+    assert untwist.to.rotvec_deg == back.to.rotvec_deg == straight
+    assert not rig._twisted
 
 
 # -- events and frames that stop ---------------------------------------------------------------

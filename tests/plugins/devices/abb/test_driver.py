@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sliplab.plugins.devices import abb
 from sliplab.plugins.devices.abb import settings
 from sliplab.plugins.devices.abb.driver import AbbArm
+from sliplab.plugins.devices.abb.program import TURN_DEG_S
 from sliplab.plugins.devices.abb.rws import REQUEST_S, START_REQUESTS
 from sliplab.rigs.core.capabilities import Arm, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
@@ -63,6 +64,20 @@ def test_a_twist_is_on_the_spot_and_at_its_speed(abb_pair: MakeAbb) -> None:
     speed = np.polyfit(t_s, angle.as_rotvec(degrees=True)[:, 2], 1)[0]
     assert speed == pytest.approx(4.0, rel=0.01)
     assert (span[1] - span[0]) / 1e9 == pytest.approx(20 / 4.0, rel=0.05)
+
+
+def test_a_turn_on_a_short_way_is_slow(abb_pair: MakeAbb) -> None:
+    """29 degrees in a move of 0.2 mm at 10 mm/s, in which the controller turns the tool too."""
+    arm, _ = abb_pair(rate=2.0, cycle_hz=50)
+    arm.read_poses()
+    x, y, z = HOME.xyz_mm
+    arm.start([Segment(Pose((x, y, z + 0.2), turned_about_z(HOME.rotvec_deg, 29.0)), 10.0)])
+    until(lambda: arm.progress().done, 20.0)
+    assert len(arm.progress().finished) == 1
+    chunk = arm.read_poses()
+    turned = Rotation.from_rotvec(chunk.rotvec_deg, degrees=True)
+    steps = np.degrees((turned[:-1].inv() * turned[1:]).magnitude())
+    assert (steps / np.diff(chunk.t_ns) * 1e9).max() == pytest.approx(TURN_DEG_S, rel=0.1)
 
 
 def test_it_is_an_arm_that_sets_its_tool(abb_pair: MakeAbb) -> None:
