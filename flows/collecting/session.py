@@ -21,7 +21,7 @@ from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.live_feed import LiveFeed
-from sliplab.flows.collecting.preparation import ask, change_over, find_zero
+from sliplab.flows.collecting.preparation import ask, change_over, find_zero, warm_up
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -306,13 +306,7 @@ class TrialCollector:
         """Warm up the skin and find depth zero, unless that is done."""
         maintenance = self.plan.protocol.collection.maintenance
         if maintenance.warm_up is not None and not self._warm:
-            warm_up = maintenance.warm_up
-            self.rig.press(
-                float(warm_up.depth),
-                float(warm_up.speed),
-                float(warm_up.clearance),
-                warm_up.presses,
-            )
+            warm_up(self.rig, self.plan, trial)
             self._warm = True
         if maintenance.rezero is not None and self.rig.event_camera is not None:
             slot = self.plan.rezero_task(trial).slot

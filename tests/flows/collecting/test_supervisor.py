@@ -119,7 +119,7 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     put(work.rig, "touch_off", lambda *given: (done.append("zero"), touch_off(*given))[1])
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
-    assert done == ["warm up", "zero"] * 2
+    assert done == ["zero", "warm up", "zero"] * 2
     assert len(campaign.committed()) == 3
 
 
