@@ -5,7 +5,8 @@ from __future__ import annotations
 from sliplab.protocols import Plan, PlannedTrial, Task
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import Rig, TouchedZero
+from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, TouchedZero
+from sliplab.rigs.core.touching import QUIET_S
 
 
 def ask(rig: Rig, task: Task) -> None:
@@ -54,6 +55,27 @@ def warm_up(rig: Rig, plan: Plan, trial: PlannedTrial) -> None:
         seed = hash_integer(collection.seed, "before warm-up", plan.rezero_task(trial).slot)
         rig.touch_off(float(rezero.speed), float(rezero.search), seed)
     rig.press(float(asked.depth), float(asked.speed), float(asked.clearance), asked.presses)
+
+
+def preparation_seconds(rig: Rig, plan: Plan, *, warm: bool, zeroed: bool) -> float:
+    """Return the planned time of warm-up and touches, without ramps, s.
+
+    Args:
+        warm: the skin is warm.
+        zeroed: depth zero is found.
+    """
+    upkeep = plan.protocol.collection.maintenance
+    pressed, rezero = None if warm else upkeep.warm_up, upkeep.rezero
+    out_mm_s = rig.at_most(RETRACT_SPEED_MM_S)
+    seconds = 0.0
+    if pressed is not None:
+        way_mm = float(pressed.depth + pressed.clearance)
+        seconds += pressed.presses * way_mm * (1 / float(pressed.speed) + 1 / out_mm_s)
+    if rezero is not None and rig.event_camera is not None:
+        touches = (0 if zeroed else rezero.touches) + (pressed is not None)
+        way_mm = 2 * float(rezero.search)  # from as far before the plane to as far beyond it
+        seconds += touches * (QUIET_S + way_mm * (1 / float(rezero.speed) + 1 / out_mm_s))
+    return seconds
 
 
 def find_zero(rig: Rig, plan: Plan, trial: PlannedTrial) -> TouchedZero | None:

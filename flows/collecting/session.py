@@ -21,7 +21,13 @@ from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.live_feed import LiveFeed
-from sliplab.flows.collecting.preparation import ask, change_over, find_zero, warm_up
+from sliplab.flows.collecting.preparation import (
+    ask,
+    change_over,
+    find_zero,
+    preparation_seconds,
+    warm_up,
+)
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -120,7 +126,10 @@ def open_session(
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
         ):
-            rig = build_rig(run_request.rig, stopping.requested)
+            # a motion has no planned end that is certain, so the window ends whatever runs
+            rig = build_rig(
+                run_request.rig, lambda: stopping.requested() or supervisor.is_window_over()
+            )
             logged = LoggedContext(store, campaign.name)
             campaign.add_bench_record(_session_record(run_request, campaign, logged.read()))
             collector = TrialCollector(
@@ -262,14 +271,22 @@ class TrialCollector:
             RigError: a device failed, or the operator did not carry out a request.
             StoreError: the store's disk is full, read-only or failing.
             CampaignStopped: the supervisor ended the campaign.
+            WindowOver: the time window ended; the arm has been stopped and is clear.
             KeyboardInterrupt: a stop was requested.
         """
         for trial in trials:
-            with translated_disk_errors(self.campaign.folder, RigError):
-                if not self._may_take(trial):
-                    continue
-                self._prepare(trial)
-                self._take_with_retakes(trial)
+            try:
+                with translated_disk_errors(self.campaign.folder, RigError):
+                    if not self._may_take(trial):
+                        continue
+                    self._prepare(trial)
+                    self._take_with_retakes(trial)
+            except StopRequested as stop:
+                if self.supervisor is None or not self._by_window():
+                    raise
+                raise self.supervisor.window_over(
+                    f"which stopped the arm before {trial.id} was complete"
+                ) from stop
             self._previous = trial
 
     def fresh_start(self) -> None:
@@ -277,7 +294,7 @@ class TrialCollector:
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: PlannedTrial) -> bool:
-        may = self.supervisor is None or self.supervisor.may_take(trial)
+        may = self.supervisor is None or self.supervisor.may_take(trial, self._due_s(trial))
         if self.supervisor is not None and self.supervisor.was_paused():
             self.fresh_start()
         before, self._logged = self._logged, unplanned(self.context(), self.plan)
@@ -302,8 +319,24 @@ class TrialCollector:
                 ask(self.rig, task)
         self._warm_and_zero(trial)
 
+    def _check_window(self, trial: PlannedTrial) -> None:
+        """Check that the trial still fits into the window: what came before may have taken long."""
+        if self.supervisor is not None:
+            self.supervisor.check_window(trial, self._due_s(trial))
+
+    def _by_window(self) -> bool:
+        """Return whether the end of the time window, and no person, stopped the arm."""
+        over = self.supervisor is not None and self.supervisor.is_window_over()
+        return over and not stopping.requested()
+
+    def _due_s(self, trial: PlannedTrial) -> float:
+        """Return the planned time of warm-up and touches that are due before a trial, s."""
+        zeroed = self.plan.rezero_task(trial).slot == self._zero_slot
+        return preparation_seconds(self.rig, self.plan, warm=self._warm, zeroed=zeroed)
+
     def _warm_and_zero(self, trial: PlannedTrial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
+        self._check_window(trial)  # a person may have taken hours
         maintenance = self.plan.protocol.collection.maintenance
         if maintenance.warm_up is not None and not self._warm:
             warm_up(self.rig, self.plan, trial)
@@ -313,6 +346,7 @@ class TrialCollector:
             if slot != self._zero_slot:
                 zero = find_zero(self.rig, self.plan, trial)
                 self._zero_slot, self._zero_sd_mm = slot, None if zero is None else zero.sd_mm
+        self._check_window(trial)
 
     def _take_with_retakes(self, trial: PlannedTrial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
@@ -404,7 +438,8 @@ class TrialCollector:
             writer.abandon()
         with suppress(OSError):
             if writer.folder.exists() and not (writer.folder / RECORD).exists():
-                self.campaign.quarantine(writer.folder, _cause(error))
+                cause = "its time window ended" if self._by_window() else _cause(error)
+                self.campaign.quarantine(writer.folder, cause)
 
     def _record(
         self,
