@@ -18,6 +18,12 @@ CASES = """
     driver: abacus | | 'mock'
     limits.speed: 5 kg | | mm/s
     poll: 2 s | | at most 1 s
+    calibration.touch_depth: -3 mm | | must be from 0 mm to limits.depth = 4 mm
+    calibration.touch_depth: 50 mm | | must be from 0 mm to limits.depth = 4 mm
+    calibration.depth_zero: {zero: 6 mm, taught: 2026-11-29, residual: 0.01 mm, method: typed} \
+| .zero | is farther from the taught plane than limits.depth = 4 mm: teach both
+    calibration.depth_zero: {zero: -6 mm, taught: 2026-11-29, residual: 0.01 mm, method: typed} \
+| .zero | is farther from the taught plane than limits.depth = 4 mm: teach both
     calibration.contact_plane.centre: [a, 0 mm, 0 mm] | [0] | number with a unit
     calibration.contact_plane.above: [399 mm, 120 mm, 300 mm] | ^calibration | one line
     mock: {event_camera: {noise_hz: -1}} | .event_camera.noise_hz | greater than or equal to 0
