@@ -40,7 +40,7 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.rig_limits import RigLimits, check_zero
+from sliplab.rigs.rig_limits import RigLimits, check_depth_unit, check_zero
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -350,6 +350,7 @@ def _check(rig: RigFile) -> None:
             lambda: None if arm is None else check_units(arm),
             lambda: _masked_secrets(rig),
             lambda: check_zero(rig.calibration, rig.limits),
+            lambda: check_depth_unit(rig.limits),
         )
     )
 

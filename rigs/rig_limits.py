@@ -10,6 +10,10 @@ from sliplab.protocols.yaml_file import StrictModel
 from sliplab.rigs.core.calibration import Calibration
 
 
+_DEEPEST_MM = 50.0
+"""Largest plausible depth of a press; no skin is thicker, and one given in metres is larger."""
+
+
 class RigLimits(StrictModel):
     """Limits of this arm at this rig, whatever a protocol says."""
 
@@ -36,3 +40,14 @@ def check_zero(calibration: Calibration, limits: RigLimits) -> Iterator[KeyedErr
     if not abs(calibration.zero_mm) <= most_mm:
         text = f"is farther from the taught plane than limits.depth = {most_mm:g} mm: teach both"
         yield KeyedError("calibration.depth_zero.zero", f"{calibration.zero_mm:g} mm", text)
+
+
+def check_depth_unit(limits: RigLimits) -> Iterator[KeyedError]:
+    """Check that the limit of depth was not written in metres, as `arm_settings.check_units`."""
+    depth_mm = float(limits.depth)
+    if depth_mm > _DEEPEST_MM:
+        text = (
+            f"is deeper than {_DEEPEST_MM:g} mm, more than any skin is thick: write millimetres, "
+            f"such as {depth_mm / 1000:g} mm"
+        )
+        yield KeyedError("limits.depth", f"{depth_mm:g} mm", text)
