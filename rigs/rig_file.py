@@ -351,8 +351,16 @@ def _check(rig: RigFile) -> None:
             lambda: _masked_secrets(rig),
             lambda: check_zero(rig.calibration, rig.limits),
             lambda: check_depth_unit(rig.limits),
+            lambda: _check_poll(rig),
         )
     )
+
+
+def _check_poll(rig: RigFile) -> Iterator[KeyedError]:
+    """Check that the period is one that a computer can keep."""
+    if rig.poll < Decimal("0.001"):
+        text = "must be at least 1 ms: no computer looks more often"
+        yield KeyedError("poll", f"{rig.poll} s", text)
 
 
 def _masked_secrets(rig: RigFile) -> Iterator[KeyedError]:

@@ -9,7 +9,6 @@ from sliplab.protocols.quantity import PositiveMillimetres, PositiveNewtons, Pos
 from sliplab.protocols.yaml_file import StrictModel
 from sliplab.rigs.core.calibration import Calibration
 
-
 _DEEPEST_MM = 50.0
 """Largest plausible depth of a press; no skin is thicker, and one given in metres is larger."""
 

@@ -18,6 +18,7 @@ CASES = """
     driver: abacus | | 'mock'
     limits.speed: 5 kg | | mm/s
     poll: 2 s | | at most 1 s
+    poll: 0.000000001 s | | at least 1 ms
     limits.depth: 4 m | | write millimetres, such as 4 mm
     calibration.touch_depth: -3 mm | | must be from 0 mm to limits.depth = 4 mm
     calibration.touch_depth: 50 mm | | must be from 0 mm to limits.depth = 4 mm
