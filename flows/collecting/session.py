@@ -13,7 +13,7 @@ import platform
 import shutil
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -125,11 +125,13 @@ def open_session(
             feed.running(),
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
+            ExitStack() as opened,
         ):
             # a motion has no planned end that is certain, so the window ends whatever runs
             rig = build_rig(
                 run_request.rig, lambda: stopping.requested() or supervisor.is_window_over()
             )
+            opened.callback(rig.close)  # at once: what follows writes to the store, and may fail
             logged = LoggedContext(store, campaign.name)
             campaign.add_bench_record(_session_record(run_request, campaign, logged.read()))
             collector = TrialCollector(
@@ -144,14 +146,11 @@ def open_session(
                 context=logged.read,
                 feed=feed,
             )
-            try:
-                trials = run_request.due_trials(campaign)
-                left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
-                if rounds is not None:
-                    trials = rounds.next_trials()[: run_request.most]
-                yield CollectionSession(collector, supervisor, trials, left_out, rounds)
-            finally:
-                rig.close()
+            trials = run_request.due_trials(campaign)
+            left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+            if rounds is not None:
+                trials = rounds.next_trials()[: run_request.most]
+            yield CollectionSession(collector, supervisor, trials, left_out, rounds)
 
 
 @contextmanager
