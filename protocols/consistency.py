@@ -14,6 +14,7 @@ from itertools import pairwise
 from sliplab.protocols.claims import repeated
 from sliplab.protocols.factors import Factor, unknown_factor
 from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.motion import check_reference_limits
 from sliplab.protocols.phases import PlateMotion
@@ -39,6 +40,7 @@ def check_consistency(protocol: Protocol) -> None:
             lambda: _check_plate(collection),
             lambda: _check_references(collection),
             lambda: _check_claims(collection),
+            lambda: _check_creep(collection),
         )
     )
 
@@ -67,6 +69,18 @@ def _check_held_out(split: Split) -> Iterator[KeyedError]:
                     yield KeyedError(f"{key}[{index}]", level, "is listed twice as held out")
                 if part == "validation_levels" and level in split.test_levels.get(name, ()):
                     yield KeyedError(key, level, "is already held out for testing")
+
+
+def _check_creep(collection: Collection) -> Iterator[KeyedError]:
+    """Check that touching off is as slow as teaching."""
+    rezero = collection.maintenance.rezero
+    if rezero is not None and rezero.speed > MAX_CREEP_MM_S:
+        yield KeyedError(
+            "collection.maintenance.rezero.speed",
+            f"{canonical(rezero.speed)} mm/s",
+            f"must be at most {MAX_CREEP_MM_S:g} mm/s: the skin is deep in the plate before a "
+            "faster touch is noticed",
+        )
 
 
 def _check_claims(collection: Collection) -> Iterator[KeyedError]:

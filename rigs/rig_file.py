@@ -40,7 +40,7 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.rig_limits import RigLimits
+from sliplab.rigs.rig_limits import RigLimits, check_depth_unit, check_zero
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -355,9 +355,23 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
 
 def _check(rig: RigFile) -> None:
     """Check a rig file that a person gives. Raises KeyedError, all that is wrong."""
-    if rig.devices is not None:
-        arm = rig.devices.arm
-        raise_all((lambda: check_units(arm), lambda: _masked_secrets(rig)))
+    arm = None if rig.devices is None else rig.devices.arm
+    raise_all(
+        (
+            lambda: None if arm is None else check_units(arm),
+            lambda: _masked_secrets(rig),
+            lambda: check_zero(rig.calibration, rig.limits),
+            lambda: check_depth_unit(rig.limits),
+            lambda: _check_poll(rig),
+        )
+    )
+
+
+def _check_poll(rig: RigFile) -> Iterator[KeyedError]:
+    """Check that the period is one that a computer can keep."""
+    if rig.poll < Decimal("0.001"):
+        text = "must be at least 1 ms: no computer looks more often"
+        yield KeyedError("poll", f"{rig.poll} s", text)
 
 
 def _masked_secrets(rig: RigFile) -> Iterator[KeyedError]:

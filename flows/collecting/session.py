@@ -13,7 +13,7 @@ import platform
 import shutil
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -21,7 +21,13 @@ from typing import Protocol
 
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.live_feed import LiveFeed
-from sliplab.flows.collecting.preparation import ask, change_over, find_zero
+from sliplab.flows.collecting.preparation import (
+    ask,
+    change_over,
+    find_zero,
+    preparation_seconds,
+    warm_up,
+)
 from sliplab.flows.collecting.requests import carry_out, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
@@ -119,8 +125,13 @@ def open_session(
             feed.running(),
             held(run_request.rig, store.folder),
             _opened_rounds(run_request, store, campaign) as rounds,
+            ExitStack() as opened,
         ):
-            rig = build_rig(run_request.rig, stopping.requested)
+            # a motion has no planned end that is certain, so the window ends whatever runs
+            rig = build_rig(
+                run_request.rig, lambda: stopping.requested() or supervisor.is_window_over()
+            )
+            opened.callback(rig.close)  # at once: what follows writes to the store, and may fail
             logged = LoggedContext(store, campaign.name)
             campaign.add_bench_record(_session_record(run_request, campaign, logged.read()))
             collector = TrialCollector(
@@ -135,14 +146,11 @@ def open_session(
                 context=logged.read,
                 feed=feed,
             )
-            try:
-                trials = run_request.due_trials(campaign)
-                left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
-                if rounds is not None:
-                    trials = rounds.next_trials()[: run_request.most]
-                yield CollectionSession(collector, supervisor, trials, left_out, rounds)
-            finally:
-                rig.close()
+            trials = run_request.due_trials(campaign)
+            left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+            if rounds is not None:
+                trials = rounds.next_trials()[: run_request.most]
+            yield CollectionSession(collector, supervisor, trials, left_out, rounds)
 
 
 @contextmanager
@@ -262,14 +270,22 @@ class TrialCollector:
             RigError: a device failed, or the operator did not carry out a request.
             StoreError: the store's disk is full, read-only or failing.
             CampaignStopped: the supervisor ended the campaign.
+            WindowOver: the time window ended; the arm has been stopped and is clear.
             KeyboardInterrupt: a stop was requested.
         """
         for trial in trials:
-            with translated_disk_errors(self.campaign.folder, RigError):
-                if not self._may_take(trial):
-                    continue
-                self._prepare(trial)
-                self._take_with_retakes(trial)
+            try:
+                with translated_disk_errors(self.campaign.folder, RigError):
+                    if not self._may_take(trial):
+                        continue
+                    self._prepare(trial)
+                    self._take_with_retakes(trial)
+            except StopRequested as stop:
+                if self.supervisor is None or not self._by_window():
+                    raise
+                raise self.supervisor.window_over(
+                    f"which stopped the arm before {trial.id} was complete"
+                ) from stop
             self._previous = trial
 
     def fresh_start(self) -> None:
@@ -277,7 +293,7 @@ class TrialCollector:
         self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: PlannedTrial) -> bool:
-        may = self.supervisor is None or self.supervisor.may_take(trial)
+        may = self.supervisor is None or self.supervisor.may_take(trial, self._due_s(trial))
         if self.supervisor is not None and self.supervisor.was_paused():
             self.fresh_start()
         before, self._logged = self._logged, unplanned(self.context(), self.plan)
@@ -302,23 +318,34 @@ class TrialCollector:
                 ask(self.rig, task)
         self._warm_and_zero(trial)
 
+    def _check_window(self, trial: PlannedTrial) -> None:
+        """Check that the trial still fits into the window: what came before may have taken long."""
+        if self.supervisor is not None:
+            self.supervisor.check_window(trial, self._due_s(trial))
+
+    def _by_window(self) -> bool:
+        """Return whether the end of the time window, and no person, stopped the arm."""
+        over = self.supervisor is not None and self.supervisor.is_window_over()
+        return over and not stopping.requested()
+
+    def _due_s(self, trial: PlannedTrial) -> float:
+        """Return the planned time of warm-up and touches that are due before a trial, s."""
+        zeroed = self.plan.rezero_task(trial).slot == self._zero_slot
+        return preparation_seconds(self.rig, self.plan, warm=self._warm, zeroed=zeroed)
+
     def _warm_and_zero(self, trial: PlannedTrial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
+        self._check_window(trial)  # a person may have taken hours
         maintenance = self.plan.protocol.collection.maintenance
         if maintenance.warm_up is not None and not self._warm:
-            warm_up = maintenance.warm_up
-            self.rig.press(
-                float(warm_up.depth),
-                float(warm_up.speed),
-                float(warm_up.clearance),
-                warm_up.presses,
-            )
+            warm_up(self.rig, self.plan, trial)
             self._warm = True
         if maintenance.rezero is not None and self.rig.event_camera is not None:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
                 zero = find_zero(self.rig, self.plan, trial)
                 self._zero_slot, self._zero_sd_mm = slot, None if zero is None else zero.sd_mm
+        self._check_window(trial)
 
     def _take_with_retakes(self, trial: PlannedTrial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
@@ -410,7 +437,8 @@ class TrialCollector:
             writer.abandon()
         with suppress(OSError):
             if writer.folder.exists() and not (writer.folder / RECORD).exists():
-                self.campaign.quarantine(writer.folder, _cause(error))
+                cause = "its time window ended" if self._by_window() else _cause(error)
+                self.campaign.quarantine(writer.folder, cause)
 
     def _record(
         self,

@@ -47,12 +47,14 @@ class CollectionSupervisor:
     """Decides between two trials whether the next may begin; notified after each.
 
     It carries out requests from other terminals, and watches the time window, the disk and the
-    reference trials. Nothing is checked while the arm moves, and all of it before it moves again.
+    reference trials. Only the window's end is looked at while the arm moves; all of it is checked
+    before it moves again.
 
     Attributes:
         wait: waits some seconds, and answers stop requests.
         listener: notified of pauses.
         clock: returns seconds since 1970; decides when the window ends.
+        in_real_time: False for a rig in virtual time, on which nothing moves that could be late.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class CollectionSupervisor:
         self.wait: Callable[[float], None] = stopping.wait
         self.listener = listener
         self.clock: Callable[[], float] = time.time
+        self.in_real_time = not run_request.rig.in_virtual_time
         self._seen: frozenset[str] = frozenset()
         self._paused: ControlRequest | None = None
         self._was_paused = False
@@ -83,8 +86,11 @@ class CollectionSupervisor:
         """
         self._references.begin()
 
-    def may_take(self, trial: PlannedTrial) -> bool:
+    def may_take(self, trial: PlannedTrial, preparation_s: float = 0.0) -> bool:
         """Return whether to take `trial` now; waits while the store is paused.
+
+        Args:
+            preparation_s: planned time of what the arm does before the trial, s.
 
         Raises:
             KeyboardInterrupt: a stop was requested.
@@ -95,9 +101,42 @@ class CollectionSupervisor:
             self._wait_while_paused(trial)
         if trial.id in self._skipped:
             return False
-        self._check_window(trial)
+        self.check_window(trial, preparation_s)
         self.disk.check(trial)
         return True
+
+    def check_window(self, trial: PlannedTrial, preparation_s: float = 0.0) -> None:
+        """Check that the trial's planned time fits: the arm must rest while people are present.
+
+        Args:
+            preparation_s: planned time of what the arm still does before the trial, s.
+
+        Raises:
+            WindowOver: it does not.
+        """
+        until = self._run_request.until
+        if until is None:
+            return
+        planned = (
+            preparation_s + self._run_request.plan.seconds(trial) if self.in_real_time else 0.0
+        )
+        if self.clock() + planned > until:
+            raise self.window_over(f"too soon for {trial.id}")
+
+    def is_window_over(self) -> bool:
+        """Return whether the window has ended: the arm must rest, whatever it does."""
+        until = self._run_request.until
+        return until is not None and self.in_real_time and self.clock() > until
+
+    def window_over(self, what: str) -> WindowOver:
+        """Return the error that says when the window ends, what that means, and what follows."""
+        until = self._run_request.until
+        assert until is not None
+        return WindowOver(
+            f"the window of campaign {self._campaign.name} ends "
+            f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, {what}; "
+            "the next collection continues"
+        )
 
     def was_paused(self) -> bool:
         """Return whether there was a pause since the last call: the rig may have changed."""
@@ -147,20 +186,6 @@ class CollectionSupervisor:
         for trial, did in answer["did"].get("trials", {}).items():
             console.say(f"{request.kind} {trial}: {did}")
 
-    def _check_window(self, trial: PlannedTrial) -> None:
-        """Check that the trial's planned time fits: the arm must rest while people are present."""
-        until = self._run_request.until
-        if until is None:
-            return
-        virtual = self._run_request.rig.in_virtual_time
-        planned = 0.0 if virtual else self._run_request.plan.seconds(trial)
-        if self.clock() + planned > until:
-            raise WindowOver(
-                f"the window of campaign {self._campaign.name} ends "
-                f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, too soon for "
-                f"{trial.id}; the next collection continues"
-            )
-
     def _wait_while_paused(self, trial: PlannedTrial) -> None:
         """Wait until the pause is over."""
         why = f"paused before {trial.id} ({self._paused})"
@@ -168,7 +193,7 @@ class CollectionSupervisor:
         self.listener.on_paused(why)
         waited = 0.0
         while request := self._process_requests():
-            self._check_window(trial)
+            self.check_window(trial)
             if waited >= PAUSE_LIMIT_S:
                 raise CampaignStopped(
                     f"{self._store.folder} was paused ({request}) for "

@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import os
 import socket
+import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 from sliplab.rigs.core.arm_settings import BaseArmSettings
 
 ANSWER_S = 1.0
 """Timeout of a connection, s."""
+
+RESOLVE_S = 2.0
+"""Timeout for the address of a host name, s."""
 
 MOST_BYTES = 1 << 20
 """Largest answer of a device, bytes."""
@@ -93,6 +98,27 @@ def serial_port(port: str) -> str | None:
 
 
 def arm_lock(settings: BaseArmSettings) -> dict[str, str]:
-    """Return the lock of an arm: one program at a time at a controller's address."""
+    """Return the locks of an arm: one program at a time at a controller's address.
+
+    The addresses of a host name are locked, too: another rig file may have another of its names.
+    """
     host = settings.host.lower()
-    return {f"arm-{host}": f"the arm at {host}"}
+    return {f"arm-{name}": f"the arm at {host}" for name in (host, *addresses(host))}
+
+
+def addresses(host: str, within_s: float = RESOLVE_S) -> list[str]:
+    """Return the addresses of a host; none if they are not found within a time.
+
+    A resolver may wait for its servers for long, and cannot be interrupted: it is left behind.
+    """
+    found: list[str] = []
+
+    def resolve() -> None:
+        with suppress(OSError, UnicodeError):
+            infos = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+            found.extend(sorted({str(info[4][0]) for info in infos}))
+
+    thread = threading.Thread(target=resolve, daemon=True)
+    thread.start()
+    thread.join(within_s)
+    return list(found)

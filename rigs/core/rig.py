@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.maintenance import Rezero
+from sliplab.protocols.maintenance import MAX_CREEP_MM_S, Rezero
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import (
@@ -527,6 +527,10 @@ class Rig:
         Raises:
             RigError: no touch was detected within `search_mm`.
         """
+        if not speed_mm_s <= MAX_CREEP_MM_S:
+            raise RigError(
+                "arm", f"touches off at {MAX_CREEP_MM_S:g} mm/s at most, not {speed_mm_s:g}"
+            )
         self.plate_frame = self.plate_frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
         with self.safely(start):

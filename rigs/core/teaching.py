@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.host_clock import StallTimer
@@ -30,7 +31,6 @@ MarkerFinder = Callable[[FrameChunk], F64]
 FRAMES_HZ = 100
 APPROACH_MM_S = 5.0
 """Speed from clear of the plate to where creeping begins; events are monitored meanwhile."""
-MAX_CREEP_MM_S = 1.0
 OBLIQUE_SLOPE = 0.1
 """Lateral motion of an oblique approach per mm of depth."""
 STILL_S = 1.0

@@ -174,6 +174,7 @@ collection
     gates.path_deviation: nan mm; 1e9 mm
     gates.sync_uncertainty: {{host_time: 1e9 min}}
     maintenance.rezero.every: true; .inf; {10**12}
+    maintenance.rezero.speed: 1.1 mm/s; 50 mm/s
     maintenance.warm_up.presses: true; {10**12}
     maintenance.clean: {{every: {10**12}, prompt: clean}}
     limits.duration: 1e9 min

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import stat
+import threading
 from pathlib import Path
 
 import pytest
 
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.network import addresses, arm_lock
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held, lock_names
 from sliplab.storage.trials.lock import Locked
@@ -83,6 +86,24 @@ def test_an_arm_or_a_box_that_two_rig_files_share_is_one(folder: Path, tmp_path:
             pass
     assert stat.S_IMODE(folder.stat().st_mode) == 0o1777  # every user may lock, none may unlink
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o666}
+
+
+def test_an_arm_by_another_of_its_names_is_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_name = with_port(real(), "localhost", "/dev/ttyA")
+    by_address = with_port(real(), "127.0.0.1", "/dev/ttyB")
+    for first, second in ((by_name, by_address), (by_address, by_name)):
+        with held(first), pytest.raises(Locked, match="the arm at "):
+            held(second).__enter__()
+
+    def unknown(*given: object, **more: object) -> None:
+        raise socket.gaierror("no such host")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    assert list(arm_lock(by_name.devices.arm)) == ["arm-localhost"]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *given, **more: threading.Event().wait())
+    assert addresses("localhost", 0.05) == []
 
 
 def test_a_folder_that_is_none_is_said(folder: Path) -> None:

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.flows.collecting.session import TrialCollector
+from sliplab.flows.collecting.session import TrialCollector, open_session
 from sliplab.rigs.core.capabilities import ArmFault, RigError
+from sliplab.rigs.core.rig import Rig
 from sliplab.storage.errors import disk_full
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.trial import TrialRecord
@@ -21,7 +22,7 @@ from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.flows.collecting.test_session import checksums, session, short
-from tests.flows.conftest import take_all
+from tests.flows.conftest import requested, take_all
 from tests.patching import put
 
 TRACKS = {"level": "tracks"}
@@ -64,6 +65,23 @@ def test_a_full_disk_ends_the_stretch_and_loses_nothing(tmp_path: Path) -> None:
     depth = work.rig.plate_frame.position(work.rig.arm.pose().xyz_mm).depth_mm
     assert depth == pytest.approx(-5.0, abs=1e-3)  # clear of the plate
     goes_on(tmp_path, kept)
+
+
+def test_a_rig_is_closed_where_the_disk_is_full_before_the_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session(tmp_path, short())
+    closed: list[Rig] = []
+    close = Rig.close
+    monkeypatch.setattr(Rig, "close", lambda rig: (closed.append(rig), close(rig))[1])
+
+    def full(campaign: Campaign, data: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Campaign, "add_bench_record", full)
+    with pytest.raises(StoreError, match="disk is full"), open_session(requested(tmp_path)):
+        pass
+    assert len(closed) == 1
 
 
 def test_a_disk_too_full_for_the_cause_is_a_full_disk(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.yaml_file import parse_yaml
-from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError, Segment
 from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import at_rig, requested, take_all, tiny, tiny_gravity, write
+from tests.patching import put
 
 
 def short() -> dict[str, Any]:
@@ -116,6 +118,36 @@ def test_a_change_that_was_not_made_is_noticed(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="detects another mass"):
         take_all(work)
     assert campaign.committed() == set()
+
+
+def test_no_warm_up_presses_deeper_than_asked_for_where_the_plane_was_taught_too_deep(
+    tmp_path: Path,
+) -> None:
+    data = short()
+    upkeep = data["collection"]["maintenance"]
+    upkeep["warm_up"] = {
+        "presses": 2,
+        "depth": "2.8 mm",
+        "speed": "2 mm/s",
+        "clearance": "5 mm",
+    }
+    upkeep["rezero"]["search"] = "1.5 mm"
+    work, campaign = session(tmp_path / "a", data)
+    surface = work.rig.plate_frame  # of the plane as it is
+    deepest: list[float] = []
+    start = work.rig.arm.start
+
+    def sent(path: list[Segment]) -> None:
+        (segment,) = path
+        if segment.speed_mm_s == 2.0:  # a touch creeps
+            deepest.append(surface.position(segment.to.xyz_mm).depth_mm)
+        start(path)
+
+    put(work.rig.arm, "start", sent)
+    work.rig.plate_frame = replace(surface, origin=surface.origin + 1.4 * surface.axes[2])
+    work.take(pending_trials(work.plan, campaign)[:1])
+    assert max(deepest) == pytest.approx(2.8, abs=0.1)  # so much do touches differ
+    assert len(campaign.committed()) == 1
 
 
 def test_another_collection_or_rig_is_refused_and_new_trials_are_not(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from sliplab.flows.planning.campaign_trials import excluded_trials, pending_tria
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
 from sliplab.protocols import PlannedTrial
+from sliplab.protocols.program import Position
+from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import skipped
@@ -25,7 +27,7 @@ from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.crash import campaign as crash
 from tests.flows.collecting.test_session import checksums, session, short
-from tests.flows.conftest import requested
+from tests.flows.conftest import requested, tiny_gravity
 from tests.patching import put
 
 
@@ -119,7 +121,7 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     put(work.rig, "touch_off", lambda *given: (done.append("zero"), touch_off(*given))[1])
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
-    assert done == ["warm up", "zero"] * 2
+    assert done == ["zero", "warm up", "zero"] * 2
     assert len(campaign.committed()) == 3
 
 
@@ -222,7 +224,7 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
 
     def night() -> None:
         with open_session(replace(wanted, until=500.0)) as work:
-            work.supervisor.clock = after(3)
+            work.supervisor.clock = after(7)  # an attempt asks three times
             work.collector.rig.connect()
             work.collector.take(work.trials)
 
@@ -235,6 +237,105 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
     whole = crash.run_request(tmp_path / "undisturbed", 4)
     crash.collect(whole)
     assert crash.hashes(wanted.store) == crash.hashes(whole.store)
+
+
+@dataclass
+class Night:
+    """A collection in real time, whose clock is the simulated one, from 0 at its begin.
+
+    Attributes:
+        sent: times at which the arm began a motion, s.
+    """
+
+    until: float
+    at_s: float = 0.0
+    sent: list[float] = field(default_factory=list)
+    end: Position | None = None
+
+    def take(self, wanted: RunRequest) -> None:
+        """Collect until the window ends."""
+        with open_session(replace(wanted, until=self.until)) as work:
+            work.supervisor.in_real_time, work.supervisor.clock = True, lambda: self.at_s
+            rig = work.collector.rig
+            wait, start = rig.clock.wait, rig.arm.start
+
+            def waiting(seconds: float) -> None:
+                self.at_s += seconds
+                wait(seconds)
+
+            def starting(path: list[Segment]) -> None:
+                self.sent.append(self.at_s)
+                start(path)
+
+            put(rig.clock, "wait", waiting)
+            put(rig.arm, "start", starting)
+            rig.connect()
+            try:
+                work.collector.take(work.trials)
+            finally:
+                self.end = rig.position()
+
+
+def night(folder: Path) -> RunRequest:
+    """Request two trials, before which the skin is warmed up for long."""
+    data = short()
+    warm_up = {"presses": 20, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
+    data["collection"]["maintenance"]["warm_up"] = warm_up
+    session(folder, data)
+    return requested(folder)
+
+
+@pytest.mark.parametrize("motion", [10, -3], ids=["warm-up", "slide"])
+def test_an_arm_that_still_moves_when_the_window_ends_is_stopped(
+    motion: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undisturbed = Night(until=1e9)
+    undisturbed.take(night(tmp_path / "whole"))
+    whole = checksums(TrialStore.open(tmp_path / "whole" / "store").campaign("tiny"))
+    wanted = night(tmp_path / "a")
+    monkeypatch.setattr(CollectionSupervisor, "check_window", lambda *_: None)  # all seems to fit
+    late = Night(undisturbed.sent[motion] + 0.5)
+    with pytest.raises(WindowOver, match=r"which stopped the arm before .* next collection"):
+        late.take(wanted)
+    assert len([at_s for at_s in late.sent if at_s > late.until]) <= 1  # out of the plate
+    assert late.at_s < late.until + 2.0
+    assert late.end is not None
+    assert late.end.depth_mm < 0
+    campaign = TrialStore.open(wanted.store).campaign("tiny")
+    assert {item["cause"] for item in campaign.quarantined()} <= {"its time window ended"}
+    assert campaign.attempts() == {}
+    Night(until=1e9).take(wanted)
+    assert checksums(campaign) == whole
+
+
+def test_what_is_done_before_a_trial_counts_as_its_time(tmp_path: Path) -> None:
+    wanted = night(tmp_path / "a")
+    trial = wanted.plan.trials[0]
+    late = Night(until=wanted.plan.seconds(trial) + 60.0)  # 20 presses take 88 s
+    with pytest.raises(WindowOver, match=f"too soon for {trial.id}"):
+        late.take(wanted)
+    assert late.sent == []
+
+
+def test_a_window_may_end_while_a_person_is_asked(tmp_path: Path) -> None:
+    data = tiny_gravity()
+    session(tmp_path / "a", data)
+    wanted = requested(tmp_path / "a")
+    with open_session(replace(wanted, until=1000.0)) as work:
+        work.supervisor.in_real_time, work.supervisor.clock = True, lambda: now
+        now, rig = 0.0, work.collector.rig
+        ask = rig.operator.ask
+
+        def slow(task: str, prompt: str, expected: str) -> bool:
+            nonlocal now
+            now = 2000.0
+            return ask(task, prompt, expected)
+
+        put(rig.operator, "ask", slow)
+        put(rig.arm, "start", None)  # it is not moved
+        rig.connect()
+        with pytest.raises(WindowOver, match="too soon for"):
+            work.collector.take(work.trials)
 
 
 def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:

@@ -258,6 +258,14 @@ def test_touching_off_finds_a_surface_that_was_taught_wrong(rig: Rig) -> None:
     assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
 
 
+@pytest.mark.parametrize("speed", [1.01, 50.0, float("nan")])
+def test_touching_off_creeps(rig: Rig, speed: float) -> None:
+    notes = watched(rig)
+    with pytest.raises(RigError, match="touches off at 1 mm/s at most"):
+        rig.touch_off(speed, 1.5, 1)
+    assert notes == []
+
+
 FAR_CAMERA: dict[str, Any] = {
     "event_camera": {"px_per_mm": 11.0, "growth_mm_per_n": 0.31, "contrast": 1.74, "edge_px": 0.68},
     "scene": {"skin": {"youngs_modulus_mpa": 0.57, "base_normal_n_per_m": 144.0}},
