@@ -236,16 +236,19 @@ def _check_suffix(path: Path) -> None:
         need("pyarrow")
 
 
-def refuse_store_file(path: Path, option: str) -> None:
-    """Refuse an output that would replace a file of a store, or lie among its trials.
+def refuse_store_file(path: Path, option: str, *, again: bool = False) -> None:
+    """Refuse an output, a file or a folder, that would change a store or lie among its trials.
+
+    Args:
+        again: a folder that an earlier export made may be written again, but among the trials.
 
     Raises:
         InputError: it would.
     """
     there = path.resolve()
-    for store in there.parents:
+    for store in (there, *there.parents):
         if (store / STORE).is_file() and (
-            there.exists() or there.is_relative_to(store / "campaigns")
+            (there.exists() and not again) or there.is_relative_to(store / "campaigns")
         ):
             text = f"belongs to the store {store}; give a path outside of it"
             raise InputError(option, "", str(path), text)
