@@ -212,10 +212,20 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
     kinds: dict[str, Callable[[], bytes]] = {
         ".csv": lambda: table.to_csv(index=False).encode(),
         ".parquet": lambda: _parquet(table),
-        ".json": lambda: table.to_json(orient="records").encode(),
+        ".json": lambda: json.dumps(table_records(table), allow_nan=False).encode(),
     }
     make_folder(path.parent)
     write_bytes(path, kinds[path.suffix.lower()]())
+
+
+def table_records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows for JSON, with all digits: pandas' own JSON rounds to at most 15 decimals.
+
+    What is missing, not a number or infinite becomes None.
+    """
+    finite = table.notna() & ~table.isin([math.inf, -math.inf])
+    found: list[dict[str, Any]] = table.astype(object).where(finite, None).to_dict("records")
+    return found
 
 
 def check_table_path(path: Path) -> None:
