@@ -235,8 +235,10 @@ def _components(names: Any, count: int) -> tuple[str, ...]:
     """Return the names of a vector's components; their numbers where it has none."""
     while isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}
         (names,) = names.values()
-    if isinstance(names, dict):  # {"left": 0, "right": 1}
-        names = list(names)
+    if isinstance(names, dict):  # {"left": 0, "right": 1}, in any order; else it numbers nothing
+        numbers = {name: at for name, at in names.items() if type(at) is int}
+        fits = len(numbers) == len(names) and sorted(numbers.values()) == list(range(count))
+        names = sorted(numbers, key=numbers.__getitem__) if fits else None
     fits = isinstance(names, list) and len(names) == count
     if (
         fits

@@ -362,3 +362,26 @@ def test_a_data_set_without_a_camera_is_imported(tmp_path: Path) -> None:
         first.scalars("action_1").value, made["state"][: LENGTHS[0], 1].astype(np.float64)
     )
     assert first.record.recorded_s == pytest.approx(4 / FPS, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "streams"),
+    [
+        ({"left": 1, "right": 0}, ["right", "left"]),  # a name's number, in any order
+        ({"motors": {"left": 1, "right": 0}}, ["right", "left"]),
+        ({"left": 1, "right": 2}, ["0", "1"]),
+        ({"left": None, "right": None}, ["0", "1"]),
+        ({"left": 0, "right": True}, ["0", "1"]),
+    ],
+)
+def test_components_are_named_by_their_numbers(
+    names: Any, streams: list[str], tmp_path: Path
+) -> None:
+    made = foreign(tmp_path / "set")
+    _info(features={"action": {"dtype": "float32", "shape": [2], "names": names}})(tmp_path / "set")
+    take(tmp_path / "store", tmp_path / "set")
+    first = TrialStore.open(tmp_path / "store").campaign("theirs").recording("episode-000000")
+    for at, name in enumerate(streams):
+        np.testing.assert_array_equal(
+            first.scalars(f"action_{name}").value, made["state"][: LENGTHS[0], at]
+        )
