@@ -143,14 +143,15 @@ def import_trials(
     try:
         for trial in trials:
             on_trial(trial.name)
-            of = trial.campaign or _Imported(origin, kind, trial.simulated)
-            if of != joined:
-                of.join(campaign, trial.source)
-                joined = of
-            if trial.name in existing:
-                skipped.append(trial.name)
-                continue
             try:
+                if trial.error is None:  # else it may not say of which campaign it is
+                    of = trial.campaign or _Imported(origin, kind, trial.simulated)
+                    if of != joined:
+                        of.join(campaign, trial.source)
+                        joined = of
+                if trial.name in existing:
+                    skipped.append(trial.name)
+                    continue
                 if trial.error is not None:
                     raise trial.error
                 if trial.name in imported:
