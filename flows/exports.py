@@ -145,10 +145,16 @@ def export(request: ExportRequest) -> ExportResult:
     """Write what a request asks for.
 
     Raises:
-        InputError: see `check_export`.
+        InputError: see `check_export`; or the output belongs to a store.
         StoreError: the store does not have what the form needs.
     """
+    from sliplab.storage.formats.foreign import EXPORT_MANIFEST
+    from sliplab.storage.trials.catalogue import refuse_store_file
+
     form = check_export(request)
+    # publications refuse what exists; a model's folder may be next to the model, in its store
+    again = form.of != "trials" or (request.output / EXPORT_MANIFEST).is_file()
+    refuse_store_file(request.output, "--output", again=again)
     if form.of != "model":
         request = replace(request, place=str(located(request.place)))
     return form.write(request)

@@ -75,12 +75,12 @@ def trials(
         write_table(table, output)
         console.say(f"{plural(len(table), 'trial')}: {output}")
     if as_json:
-        import json
+        from sliplab.storage.trials.catalogue import table_records
 
         console.print_json(
             {
                 "count": len(table),
-                "trials": json.loads(table.to_json(orient="records")),
+                "trials": table_records(table),
                 "set_aside": excluded,
                 "unreadable": unreadable,
             }

@@ -24,11 +24,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
 from sliplab.storage.formats.data_folder import DataFolder
 from sliplab.storage.formats.foreign import (
-    MOST_PX,
     ForeignChunk,
     ForeignTrial,
     FormatError,
     Whole,
+    check_size,
     event_chunk,
     resolution_us,
 )
@@ -92,8 +92,9 @@ def read_counts(array: Any, part: EventFiles) -> ForeignTrial:
         raise FormatError(
             f"holds {polarities} polarities; polarity_order of the adapter names {len(order)}"
         )
-    if 0 in array.shape or max(rows, columns) > MOST_PX:
+    if 0 in array.shape:
         raise FormatError(f"holds counts of {columns} x {rows} places in {steps} steps")
+    check_size("holds counts", (columns, rows))
     if part.size_px is not None and (columns, rows) != part.size_px:
         raise FormatError(
             f"holds {columns} x {rows} places; size_px of the adapter is {list(part.size_px)}"

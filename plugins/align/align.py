@@ -63,6 +63,8 @@ _UNCONFIRMED = 3
 _LONG_NS = 1e12
 """Events so far apart rather have another unit."""
 UNKNOWN = -(2**63)
+_FITS_NS = 9.2e18
+"""What int64 ns hold: 292 years."""
 
 
 class AlignmentRefused(ValueError):
@@ -87,6 +89,7 @@ class MappedTimes:
         known: (n,) whether a time is known.
         within: (n,) whether events on both sides confirm it; beyond the events the clock is
             taken to change its drift by up to 0.4 ppm a second.
+        far: (n,) whether it is unknown because its interval is longer than int64 ns hold.
     """
 
     ns: Ints
@@ -94,6 +97,7 @@ class MappedTimes:
     high_ns: Ints
     known: Bools
     within: Bools
+    far: Bools
 
     def write(self, times_ns: Ints, path: Path) -> None:
         """Write a CSV with the times before and after, ns; empty cells where unknown."""
@@ -218,6 +222,9 @@ class Alignment:
         for begin, end in self.unclear_ns:
             low[(ns >= begin) & (ns <= end)] = np.inf
         known = high >= low
+        reach = np.abs(x + self._origin_b) + np.maximum(np.abs(low), np.abs(high))
+        far = known & (reach > _FITS_NS)
+        known &= ~far
         base = ns - self._origin_a + self._origin_b
 
         def shifted(by: Floats) -> Ints:
@@ -226,7 +233,12 @@ class Alignment:
 
         middle = np.where(known, low, 0.0) / 2 + np.where(known, high, 0.0) / 2
         return MappedTimes(
-            shifted(middle), shifted(np.floor(low)), shifted(np.ceil(high)), known, within & known
+            shifted(middle),
+            shifted(np.floor(low)),
+            shifted(np.ceil(high)),
+            known,
+            within & known,
+            far,
         )
 
     def to_json(self) -> dict[str, Any]:

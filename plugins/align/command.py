@@ -10,6 +10,7 @@ import typer
 from sliplab.flows.cli.common import DATA, JsonOption, finish
 from sliplab.flows.running import console, exit_codes
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import plural
 
 if TYPE_CHECKING:
     from sliplab.plugins.align.align import Alignment
@@ -129,6 +130,12 @@ def align_(
         asked = listed.ns
         mapped = found.map(asked)
         mapped.write(asked, out)
+        if far := int(mapped.far.sum()):
+            console.say(
+                f"warning: {plural(far, 'time')} of {len(asked)}, such as "
+                f"{asked[mapped.far][0] / 1e9:g} s, so far from the events that nothing is "
+                "known: wrong unit or origin?"
+            )
         beyond = int((mapped.known & ~mapped.within).sum())
         result |= {"written": str(out), "times": asked.size}
         result |= {"unknown": int((~mapped.known).sum()), "beyond_events": beyond}

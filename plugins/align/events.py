@@ -113,16 +113,18 @@ def _ns_of(times: ArrayLike, name: str, unit: str | None) -> Ints:
     array = np.asarray(times)
     if array.ndim != 1 or array.dtype.kind not in "iuf":
         raise InputError(name, "", None, "must be one row of numbers: seconds, or integers in ns")
+    factor = TIME_UNITS[unit or ("s" if array.dtype.kind == "f" else "ns")]
     if array.dtype.kind == "f":
         if not np.isfinite(array).all():
             bad = int(np.flatnonzero(~np.isfinite(array))[0])
             raise InputError(name, f"[{bad}]", float(array[bad]), "must be a finite time")
-        scaled = array.astype(np.longdouble) * TIME_UNITS[unit or "s"]
-        if scaled.size and np.abs(scaled).max() >= _MOST_NS:
-            raise InputError(name, "", None, "has times too large for int64 ns: check their unit")
+    scaled = array.astype(np.longdouble) * factor  # to judge integers before they overflow
+    if scaled.size and np.abs(scaled).max() >= _MOST_NS:
+        raise InputError(name, "", None, "has times too large for int64 ns: check their unit")
+    if array.dtype.kind == "f":
         result: Ints = np.rint(scaled).astype(np.int64)
         return result
-    return array.astype(np.int64) * TIME_UNITS[unit or "ns"]
+    return array.astype(np.int64) * factor
 
 
 def signal_of_csv(path: Path, unit: str | None) -> tuple[Ints, Floats]:

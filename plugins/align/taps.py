@@ -28,7 +28,8 @@ class TapAlignment:
         ns = events_from(times, "times", unit).ns
         low, high = self.found.bounds(ns)
         within = (ns >= self.found.first_ns) & (ns <= self.found.last_ns)
-        return MappedTimes(low + (high - low) // 2, low, high, np.ones(ns.size, np.bool_), within)
+        every, none = np.ones(ns.size, np.bool_), np.zeros(ns.size, np.bool_)
+        return MappedTimes(low + (high - low) // 2, low, high, every, within, none)
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary that ``sliplab align --taps --json`` prints."""

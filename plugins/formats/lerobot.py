@@ -29,6 +29,7 @@ from sliplab.storage.formats.foreign import (
     ForeignTrial,
     FormatError,
     broken,
+    resolution_us,
     rounded_us,
 )
 from sliplab.storage.formats.format import Format
@@ -62,6 +63,8 @@ _NUMBERS = re.compile(r"(float|int|uint)\d+|bool")
 _LENGTHS, _ANGLES = {"mm": 1.0, "m": 1000.0}, {"deg": 1.0, "rad": 180 / math.pi}
 _MOST_COMPONENTS, _MOST_ROWS, _MOST_GROUP, _MOST_NAME = 64, 1 << 24, 1 << 31, 32
 _FRAMES_AT_ONCE = 32
+_ROUNDING = 4
+"""Steps of the times' type by which a quotient may differ that was computed in this type."""
 _DAMAGES = (
     pa.ArrowException,
     OSError,
@@ -235,8 +238,10 @@ def _components(names: Any, count: int) -> tuple[str, ...]:
     """Return the names of a vector's components; their numbers where it has none."""
     while isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}
         (names,) = names.values()
-    if isinstance(names, dict):  # {"left": 0, "right": 1}
-        names = list(names)
+    if isinstance(names, dict):  # {"left": 0, "right": 1}, in any order; else it numbers nothing
+        numbers = {name: at for name, at in names.items() if type(at) is int}
+        fits = len(numbers) == len(names) and sorted(numbers.values()) == list(range(count))
+        names = sorted(numbers, key=numbers.__getitem__) if fits else None
     fits = isinstance(names, list) and len(names) == count
     if (
         fits
@@ -286,15 +291,38 @@ def _may_hold(group: Any, episode: int) -> bool:
 
 
 def _numbers(column: Any, width: int) -> F64:
-    """Return a column of numbers as rows; one of a single component without its axis."""
+    """Return a column of numbers as rows of floats; a single component without its axis."""
+    rows: F64 = _raw(column, width).astype(np.float64)
+    return rows
+
+
+def _raw(column: Any, width: int) -> Any:
+    """Return the same in the type of the file."""
     count = len(column)
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
         column = column.flatten()
     values = column.to_numpy(zero_copy_only=False)
     if column.null_count or values.dtype.kind not in "fiub" or len(values) != count * width:
         raise Damage(f"holds a column whose rows are not {width} numbers each")
-    rows: F64 = values.astype(np.float64).reshape(count, width)
+    rows = values.reshape(count, width)
     return rows[:, 0] if width == 1 else rows
+
+
+def _seconds(table: pa.Table, fps: float) -> tuple[F64, float]:
+    """Return the times of an episode's rows, s, and the resolution of their type, us.
+
+    LeRobot writes ``frame_index / fps`` as 32-bit floats, which are wrong by over 1 us after 16 s:
+    times that differ from the quotient by rounding only are the quotient.
+    """
+    stated = np.atleast_1d(_raw(table["timestamp"].combine_chunks(), 1))
+    seconds = stated.astype(np.float64)
+    number = np.arange(len(table), dtype=np.float64)
+    if "frame_index" in table.column_names:
+        number = np.atleast_1d(_numbers(table["frame_index"].combine_chunks(), 1))
+    rounding = min(_ROUNDING * resolution_us(stated, 1.0), 0.5 / fps)
+    if np.all(np.abs(seconds - number / fps) <= rounding):
+        return number / fps, 0.0
+    return seconds, resolution_us(stated, 1e6, whole_us=1e6)
 
 
 def _episodes(data: _DataSet) -> Iterator[Json]:
@@ -336,14 +364,14 @@ def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
             raise Damage(f"holds the episode {number} twice")
         seen.add(number)
     file = data.file(_LAYOUT["data_path"], **_place(row, "data"))
-    keys = ["episode_index", "timestamp", *(vector.key for vector in data.vectors)]
+    keys = ["episode_index", "frame_index", "timestamp", *(vector.key for vector in data.vectors)]
     with _damage(file):
         batches = list(_rows(file, keys, number))
         table = pa.Table.from_batches(batches).combine_chunks() if batches else None
         if table is None or len(table) != length:
             count = 0 if table is None else len(table)
             raise Damage(f"holds {count} rows of episode {number}, which has {length}")
-        seconds = np.atleast_1d(_numbers(table["timestamp"].combine_chunks(), 1))
+        seconds, resolution = _seconds(table, data.fps)
         times = rounded_us(seconds, 1e6)
         if times.min() < 0 or times[-1] >= LATEST_US or np.any(np.diff(times) < 0):
             raise Damage(
@@ -386,6 +414,7 @@ def _trial(data: _DataSet, row: Json, seen: set[int]) -> ForeignTrial:
         kind="lerobot",
         poses=found.poses,
         streams=found.streams,
+        resolution_us=dict.fromkeys((*data.streams.values(), "poses", *found.streams), resolution),
         cameras=cameras,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, replacing, sync_folder, write_json
 from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST
 from sliplab.storage.formats.known import known_format
+from sliplab.storage.formats.recognition import read_manifest
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.streams import EVENTS_KIND, Json
 from sliplab.storage.trials.derived import Derived
@@ -37,16 +39,21 @@ def export_trials(
         ``trials``, ``events``, ``frames`` and ``triggers`` written, and ``files``.
 
     Raises:
-        InputError: a trial does not fit the format.
+        InputError: a trial does not fit the format, or a file of its name is not of an export.
         StoreError: a trial is damaged.
     """
     how = known_format(kind)
     assert how.export is not None
+    ours = {item["file"] for item in (read_manifest(folder) or {"trials": ()})["trials"]}
+    paths = [folder / f"{recording.trial_id}{how.suffixes[0]}" for recording in recordings]
+    for path in paths:
+        if path.name not in ours and os.path.lexists(path):  # perhaps the only original
+            text = f"is not in {EXPORT_MANIFEST} and is not replaced; name a new folder"
+            raise InputError("--output", "", str(path), text)
     make_folder(folder)
     listed: list[Json] = []
-    for recording in recordings:
+    for recording, path in zip(recordings, paths, strict=True):
         on_trial(recording.trial_id)
-        path = folder / f"{recording.trial_id}{how.suffixes[0]}"
         try:
             with replacing(path) as temporary:
                 counts = how.export(recording, temporary, stream)

@@ -30,6 +30,7 @@ from sliplab.storage.trials.store import Campaign, TrialStore
 OUTSIDE = "events outside of the sensor"
 UNKNOWN_POLARITY = "events with an unknown polarity"
 NO_TIME = "{} without a valid time"
+NEGATIVE = "events with a negative time"
 """Reasons why rows are left out, by their kind."""
 NO_TIME_NS = -(1 << 63)
 """In place of a time that is not a number or is out of range."""
@@ -40,6 +41,8 @@ EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
 """File next to exported trials, from which they are imported again unchanged."""
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
+"""Columns or rows of a camera that are read."""
+TOO_FAR = f"events at a column or row above {MOST_PX - 1:,}"
 LATEST_US = 1 << 53
 """285 years; a larger value is not a time, and would not fit 64 bits of nanoseconds."""
 
@@ -259,6 +262,29 @@ def refusal(file: Path, error: FormatError) -> InputError:
     return kind(file, error.key, None, str(error))
 
 
+_PIXEL = ((OUTSIDE, 0, 1 << 64), (TOO_FAR, 0, MOST_PX))
+_RANGES: tuple[tuple[tuple[str, int, int], ...], ...] = (
+    _PIXEL,
+    _PIXEL,
+    ((UNKNOWN_POLARITY, 0, 2),),
+    ((NO_TIME.format("events"), -LATEST_US, LATEST_US), (NEGATIVE, 0, LATEST_US)),
+)
+"""Why x, y, polarity or time of an event cannot be right outside of a range, from a value up to
+below another; the last range of each lies in those before."""
+
+
+def check_size(what: str, size: tuple[int, int]) -> None:
+    """Check columns and rows of a camera. Raises FormatError.
+
+    Args:
+        what: has this size, such as "states a sensor".
+    """
+    if max(size) > MOST_PX:
+        raise FormatError(
+            f"{what} of {size[0]} x {size[1]} pixels; read are up to {MOST_PX:,} columns and rows"
+        )
+
+
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -> ForeignChunk:
     """Return columns of a foreign file as a chunk, without the events that cannot be right.
 
@@ -277,24 +303,19 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any, resolution_us: float = 0.0) -
         raise FormatError("contains event values that are not integers")
     if columns[2].dtype.kind == "i" and len(columns[2]) and columns[2].min() == -1:
         columns[2] = np.where(columns[2] == -1, 0, columns[2])
-    limits = (
-        (OUTSIDE, MOST_PX),
-        (OUTSIDE, MOST_PX),
-        (UNKNOWN_POLARITY, 2),
-        (NO_TIME.format("events"), LATEST_US),
-    )
     good, left_out = None, Counter[str]()
-    for column, (reason, most) in zip(columns, limits, strict=True):
+    for column, ranges in zip(columns, _RANGES, strict=True):
         if not len(column) or column.dtype.kind == "b":
             continue
-        if column.min() >= 0 and column.max() < most:
+        if column.min() >= 0 and column.max() < ranges[-1][2]:
             continue
-        right = (column >= 0) & (column < most)
-        right = right if good is None else right & good
-        wrong = (len(right) if good is None else int(good.sum())) - int(right.sum())
-        if wrong:
-            left_out[reason] += wrong
-        good = right
+        for reason, least, most in ranges:
+            right = (column >= least) & (column < most)
+            right = right if good is None else right & good
+            wrong = (len(right) if good is None else int(good.sum())) - int(right.sum())
+            if wrong:
+                left_out[reason] += wrong
+            good = right
     if good is not None:
         columns = [column[good] for column in columns]
     return ForeignChunk(

@@ -43,6 +43,7 @@ from sliplab.storage.formats.foreign import (
     NoEvents,
     Whole,
     as_damage,
+    check_size,
     inside,
     left_out_of,
     refusal,
@@ -143,14 +144,15 @@ def import_trials(
     try:
         for trial in trials:
             on_trial(trial.name)
-            of = trial.campaign or _Imported(origin, kind, trial.simulated)
-            if of != joined:
-                of.join(campaign, trial.source)
-                joined = of
-            if trial.name in existing:
-                skipped.append(trial.name)
-                continue
             try:
+                if trial.error is None:  # else it may not say of which campaign it is
+                    of = trial.campaign or _Imported(origin, kind, trial.simulated)
+                    if of != joined:
+                        of.join(campaign, trial.source)
+                        joined = of
+                if trial.name in existing:
+                    skipped.append(trial.name)
+                    continue
                 if trial.error is not None:
                     raise trial.error
                 if trial.name in imported:
@@ -466,9 +468,11 @@ def _events(trial: ForeignTrial, content: _Content) -> Iterator[EventChunk]:
     """Yield the events of a trial that can be right, in the file's order."""
     for chunk in trial.events():
         content.size_px = trial.event_px()
-        if content.size_px is not None and len(chunk):
-            x, y = content.latest_px
-            content.latest_px = max(x, int(chunk.x.max())), max(y, int(chunk.y.max()))
+        if content.size_px is not None:
+            check_size("states a sensor", content.size_px)
+            if len(chunk):
+                x, y = content.latest_px
+                content.latest_px = max(x, int(chunk.x.max())), max(y, int(chunk.y.max()))
         chunk = inside(chunk, content.size_px)
         content.left_out.update(left_out_of(chunk))
         if len(chunk):

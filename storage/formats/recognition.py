@@ -429,10 +429,10 @@ def _kind(file: Path) -> str | None:
 def _manifest_of(path: Path, kind: str) -> Json | None:
     """Return the manifest of a folder whose files are of a format; None if there is none."""
     single = kind == MIXED or known_format(kind).read is not None
-    return _read_manifest(path) if single and path.is_dir() else None
+    return read_manifest(path) if single and path.is_dir() else None
 
 
-def _read_manifest(folder: Path) -> Json | None:
+def read_manifest(folder: Path) -> Json | None:
     """Read and check the manifest of an exported campaign; None if there is none.
 
     Raises:

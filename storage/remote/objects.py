@@ -142,11 +142,16 @@ class Remote:
         """Make an empty place one of ours.
 
         Raises:
+            InputError: it is a folder of a store.
             RemoteError: it contains other files, or is of a newer version.
         """
+        from sliplab.storage.trials.catalogue import refuse_store_file
+
         try:
             self.check()
         except RemoteMissing:
+            if self._local:
+                refuse_store_file(Path(self._root), "URL")
             listed = [str(entry["name"]).rpartition("/")[2] for entry in self._list("")]
             if not all(map(is_temporary, listed)):  # a first push that was killed
                 raise RemoteError(

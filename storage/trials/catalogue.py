@@ -212,10 +212,20 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
     kinds: dict[str, Callable[[], bytes]] = {
         ".csv": lambda: table.to_csv(index=False).encode(),
         ".parquet": lambda: _parquet(table),
-        ".json": lambda: table.to_json(orient="records").encode(),
+        ".json": lambda: json.dumps(table_records(table), allow_nan=False).encode(),
     }
     make_folder(path.parent)
     write_bytes(path, kinds[path.suffix.lower()]())
+
+
+def table_records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows for JSON, with all digits: pandas' own JSON rounds to at most 15 decimals.
+
+    What is missing, not a number or infinite becomes None.
+    """
+    finite = table.notna() & ~table.isin([math.inf, -math.inf])
+    found: list[dict[str, Any]] = table.astype(object).where(finite, None).to_dict("records")
+    return found
 
 
 def check_table_path(path: Path) -> None:
@@ -236,16 +246,19 @@ def _check_suffix(path: Path) -> None:
         need("pyarrow")
 
 
-def refuse_store_file(path: Path, option: str) -> None:
-    """Refuse an output that would replace a file of a store, or lie among its trials.
+def refuse_store_file(path: Path, option: str, *, again: bool = False) -> None:
+    """Refuse an output, a file or a folder, that would change a store or lie among its trials.
+
+    Args:
+        again: a folder that an earlier export made may be written again, but among the trials.
 
     Raises:
         InputError: it would.
     """
     there = path.resolve()
-    for store in there.parents:
+    for store in (there, *there.parents):
         if (store / STORE).is_file() and (
-            there.exists() or there.is_relative_to(store / "campaigns")
+            (there.exists() and not again) or there.is_relative_to(store / "campaigns")
         ):
             text = f"belongs to the store {store}; give a path outside of it"
             raise InputError(option, "", str(path), text)

@@ -116,7 +116,7 @@ def look_through(folder: Path, with_trials: bool = True) -> None:
     """Everything that reads a store without devices; one fault does not hide the others."""
     from sliplab.protocols.errors import InputError
     from sliplab.storage.errors import StoreError
-    from sliplab.storage.trials.catalogue import catalogue
+    from sliplab.storage.trials.catalogue import catalogue, table_records
     from sliplab.storage.trials.control import open_requests, paused, skipped
     from sliplab.storage.trials.store import TrialStore
     from sliplab.storage.trials.verify import verify
@@ -124,7 +124,7 @@ def look_through(folder: Path, with_trials: bool = True) -> None:
     store = TrialStore.open(folder)
     if with_trials:
         json.dumps([vars(item) for item in verify(store)], allow_nan=False)
-        json.loads(catalogue(store, []).to_json(orient="records"))
+        json.dumps(table_records(catalogue(store, [])), allow_nan=False)
     open_requests(store)
     paused(store)
     found: StoreError | InputError | None = None

@@ -27,7 +27,7 @@ from sliplab.plugins.formats.evt import (
 )
 from sliplab.plugins.formats.evt import OUTSIDE as PLACE
 from sliplab.plugins.formats.ros.messages import EVENTS, MONO, EventPacket, Fields, unpack_mono
-from sliplab.storage.formats.foreign import MOST_PX, OUTSIDE, ForeignChunk, FormatError
+from sliplab.storage.formats.foreign import OUTSIDE, ForeignChunk, FormatError
 from sliplab.storage.kernels import njit
 from sliplab.storage.streams import I64, U8, U16, EventChunk
 
@@ -109,7 +109,7 @@ class EventDecoder:
             packet = EventPacket.parse(fields)
             height, width = packet.height, packet.width
             found = self._unpacked(packet)
-        if 0 < width <= MOST_PX and 0 < height <= MOST_PX:
+        if width and height:
             self.size = self.size or (width, height)
         return found
 

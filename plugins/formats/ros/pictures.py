@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.plugins.formats.ros.messages import Fields
-from sliplab.storage.formats.foreign import MOST_PX, FormatError, grey
+from sliplab.storage.formats.foreign import FormatError, check_size, grey
 from sliplab.storage.formats.pictures import decode_picture
 from sliplab.storage.streams import U8
 
@@ -85,8 +85,9 @@ class PictureDecoder:
             size = _CHANNELS[colours] * (1 + wide)
         else:
             raise FormatError(f"holds frames as {encoding!r:.40}, which are not read")
-        if not 0 < width <= MOST_PX or not 0 < height <= MOST_PX:
+        if not width or not height:
             raise FormatError(f"holds a frame of {width} x {height}")
+        check_size("holds a frame", (width, height))
         if step < width * size or len(data) < step * height:
             raise FormatError(f"holds a frame of {width} x {height} in {len(data)} bytes")
         rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size]

@@ -225,3 +225,32 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path) -> None:
     assert [item.name for item in collected(TrialStore.open(store))] == ["c"]
     with pytest.raises(InputError, match="without an adapter"):
         collected(TrialStore.open(store), ["tiny"])
+
+
+def test_exports_replace_no_original_and_nothing_of_a_store(tmp_path: Path) -> None:
+    originals, store, out = tmp_path / "originals", tmp_path / "store", tmp_path / "out"
+    originals.mkdir()
+    lab_hdf5(originals / "slide.h5")
+    assert outcome("import", originals, "--store", store, "--name", "a", "--json")[0] == 0
+    trial = store / "campaigns/a/trials/slide"
+    before = {path: path.read_bytes() for path in (originals / "slide.h5", trial / "data.h5")}
+    asked = ("export", store, "a", "--as", "dsec", "--output")
+    whole = ("export", store, "--as", "croissant", "--output")
+    (store / "there").mkdir()
+    belongs = f"belongs to the store {store}; give a path outside of it"
+    for words, says in (
+        ((*asked, originals), "slide.h5: is not in sliplab-export.json and is not replaced"),
+        *(((*asked, place), belongs) for place in (trial, trial / "new", store, store / "there")),
+        ((*whole, store / "campaigns/b"), belongs),
+        (("push", store, f"file://{store}/campaigns/pp"), belongs),
+        (("push", store, f"file://{store}/there"), belongs),
+    ):
+        done = here(*words)
+        assert done.returncode == 2, words
+        assert says in " ".join(done.stderr.split())
+    assert before == {path: path.read_bytes() for path in before}
+    assert {path.name for path in (store / "campaigns").iterdir()} == {"a"}
+    for place in (out, store / "out"):  # its own files are replaced, also within the store
+        assert [here(*asked, place).returncode for _ in range(2)] == [0, 0]
+    (out / "sliplab-export.json").unlink()
+    assert here(*asked, out).returncode == 2

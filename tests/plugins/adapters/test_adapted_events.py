@@ -238,7 +238,7 @@ def test_rows_out_of_order_are_sorted_and_polarities_are_those_named(tmp_path: P
         ("time,x,y,p\n1,2,-3,1\n", "events: 1 .*outside of the .* gives its camera; 0 can"),
         ("time,x,y,p\n1,2,3,1\n2,2,3,2\n", "polarities from 1 to 2, all above 0; `positive` says"),
         ("time,x,y,p\n1,2,3,-1\n2,2,3,0\n", "polarities from -1 to 0, none above 0; `positive`"),
-        ("time,x,y,p\n-1,2,3,1\n", "events: 1 events without a valid time; 0 can"),
+        ("time,x,y,p\n-1,2,3,1\n", "events: 1 events with a negative time; 0 can"),
         ("", "has no column time"),
         ("time,x,y,p\n", "contains no event: its length is unknown"),
     ],

@@ -155,6 +155,8 @@ def test_intervals_widen_beyond_the_events() -> None:
         ([1.0] * 9, {"max_drift_ppm": 0}, r"must be in \(0, 50000\]"),
         ([1.0] * 9, {"within_s": -1.0, "offset_s": 1.0}, "must be positive"),
         ([1e12] * 9, {}, "check their unit"),
+        ([10**12] * 9, {"unit": "s"}, "check their unit"),
+        (np.full(9, 2**63 + 1, np.uint64), {}, "check their unit"),
     ],
 )
 def test_wrong_arguments_are_named(a: Any, options: dict[str, Any], text: str) -> None:
@@ -344,6 +346,28 @@ def test_times_beyond_the_events_are_counted_and_an_older_file_is_kept(tmp_path:
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert (tmp_path / "out.csv").read_bytes() == written
+
+
+def test_times_too_far_for_any_interval_are_unknown(tmp_path: Path) -> None:
+    taps = np.cumsum(np.random.default_rng(RNG).uniform(0.5, 1.5, 40))
+    asked = np.array([-4.5e9, -1e9, -1e8, 1e8, 1e9, 4.5e9])
+    mapped = sliplab.align(taps, taps + 7.0).map(asked)
+    assert mapped.known.tolist() == [False, False, True, True, False, False]
+    assert (mapped.far == ~mapped.known).all()
+    assert (mapped.ns[mapped.far] == UNKNOWN).all()
+    assert (mapped.low_ns < mapped.ns)[mapped.known].all()
+    assert (mapped.ns < mapped.high_ns)[mapped.known].all()
+    late = sliplab.align(taps + 4.5e9, taps - 4.5e9).map(taps[:3] + 4.5e9)
+    np.testing.assert_allclose(late.ns / 1e9, taps[:3] - 4.5e9, rtol=0, atol=1e-5)
+    for name, values in (("a", taps), ("b", taps + 7.0), ("asked", asked)):
+        _write(tmp_path / f"{name}.csv", "t", values)
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    done = here("align", *files, "--map", tmp_path / "asked.csv", "--out", tmp_path / "out.csv")
+    assert done.returncode == 0
+    said = " ".join(done.stderr.split())
+    assert "warning: 4 times of 6, such as -4.5e+09 s, so far from the events" in said
+    assert "wrong unit or origin?" in said
+    assert (tmp_path / "out.csv").read_text().count(",,,,0\n") == 4
 
 
 def test_taps_in_two_signals_align_their_clocks(tmp_path: Path) -> None:

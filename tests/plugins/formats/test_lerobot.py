@@ -362,3 +362,80 @@ def test_a_data_set_without_a_camera_is_imported(tmp_path: Path) -> None:
         first.scalars("action_1").value, made["state"][: LENGTHS[0], 1].astype(np.float64)
     )
     assert first.record.recorded_s == pytest.approx(4 / FPS, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "streams"),
+    [
+        ({"left": 1, "right": 0}, ["right", "left"]),  # a name's number, in any order
+        ({"motors": {"left": 1, "right": 0}}, ["right", "left"]),
+        ({"left": 1, "right": 2}, ["0", "1"]),
+        ({"left": None, "right": None}, ["0", "1"]),
+        ({"left": 0, "right": True}, ["0", "1"]),
+    ],
+)
+def test_components_are_named_by_their_numbers(
+    names: Any, streams: list[str], tmp_path: Path
+) -> None:
+    made = foreign(tmp_path / "set")
+    _info(features={"action": {"dtype": "float32", "shape": [2], "names": names}})(tmp_path / "set")
+    take(tmp_path / "store", tmp_path / "set")
+    first = TrialStore.open(tmp_path / "store").campaign("theirs").recording("episode-000000")
+    for at, name in enumerate(streams):
+        np.testing.assert_array_equal(
+            first.scalars(f"action_{name}").value, made["state"][: LENGTHS[0], at]
+        )
+
+
+SINGLE = np.float32
+
+
+@pytest.mark.parametrize(
+    ("stamps", "exact", "gated"),
+    [
+        (lambda n: (n / FPS).astype(SINGLE), True, False),  # as LeRobot writes them
+        (lambda n: n.astype(SINGLE) * SINGLE(1 / FPS), True, False),
+        (lambda n: n / FPS + 1.7e9, False, False),
+        (lambda n: n / FPS + 2e-5 * (n % 2), False, False),  # stamps of its own, fine enough
+        (lambda n: (n / FPS + 1.7e9).astype(SINGLE), False, True),
+        (lambda n: (n / FPS + 2e-3 * (n % 2)).astype(SINGLE), False, True),
+        (lambda n: (n / FPS).astype(np.float16), False, True),
+        (lambda n: n, False, True),
+    ],
+)
+def test_times_are_as_exact_as_their_type_or_gated(
+    stamps: Any, exact: bool, gated: bool, tmp_path: Path
+) -> None:
+    rows = np.arange(9000)
+    foreign(tmp_path / "set")
+    (tmp_path / "set/meta/info.json").write_text(
+        json.dumps(
+            {
+                "codebase_version": "v3.0",
+                "fps": FPS,
+                "features": {
+                    "observation.state": {"dtype": "float32", "shape": [6], "names": STATE[:6]},
+                    "action": {"dtype": "float32", "shape": [1]},
+                },
+            }
+        )
+    )
+    table = {
+        "observation.state": pa.array(np.zeros((9000, 6)).tolist(), pa.list_(pa.float32(), 6)),
+        "action": rows.astype(SINGLE),
+        "timestamp": stamps(rows),
+        "frame_index": rows,
+        "episode_index": np.zeros(9000, int),
+    }
+    pq.write_table(pa.table(table), tmp_path / "set/data/chunk-000/file-000.parquet")
+    _episodes(length=9000)(tmp_path / "set")
+    path = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(path).slice(0, 1), path)
+    take(tmp_path / "store", tmp_path / "set")
+    (trial,) = TrialStore.open(tmp_path / "store").campaign("theirs").recordings()
+    times = rows / FPS if exact else stamps(rows).astype(np.float64)
+    expected = np.rint(times * 1e6).astype(np.int64) * 1000
+    np.testing.assert_array_equal(trial.scalars("action").t_ns, expected)
+    failed = {f"{name}_time_resolution_us" for name in ("poses", "action")} if gated else set()
+    assert set(trial.record.quality.gates) == failed
+    assert trial.record.quality.passed == (not gated)

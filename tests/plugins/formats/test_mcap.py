@@ -394,12 +394,36 @@ def test_trials_of_two_campaigns_are_not_mixed(
             for one in where.recordings():
                 write_mcap(folder / f"{one.folder.name}.mcap", store, where, one)
     made = TrialStore.create(tmp_path / "store")
-    with pytest.raises(InputError, match=r"--name = all: has another protocol or rig than t\.mcap"):
-        take(made, folder, "all")
+    (failed,) = take(made, folder, "all")["failed"]
+    assert failed["file"] == "t.mcap"
+    assert failed["reason"].startswith("--name = all: has another protocol or rig than t.mcap")
     assert len(made.campaign("all").committed()) == 4
     commit(campaign(tmp_path / "other", "mine"), "x")
-    with pytest.raises(InputError, match="--name = mine: has another protocol or rig"):
-        take(TrialStore.open(tmp_path / "other"), folder, "mine")
+    result = take(TrialStore.open(tmp_path / "other"), folder, "mine")
+    assert result["imported"] == ["t"]  # its protocol and rig are the same
+    reasons = [each["reason"] for each in result["failed"]]
+    assert len(reasons) == 4
+    assert all("--name = mine: has another protocol or rig" in text for text in reasons)
+
+
+def test_a_damaged_file_stops_no_other_and_is_named(rich: TrialStore, tmp_path: Path) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    (where,) = rich.campaigns()
+    (one,) = where.recordings()
+    write_mcap(folder / "t.mcap", rich, where, one)
+    whole = (folder / "t.mcap").read_bytes()
+    for name in ("a", "z"):  # before and behind the good one
+        (folder / f"{name}.mcap").write_bytes(whole[: len(whole) // 2])
+    made = TrialStore.create(tmp_path / "store")
+    for key in ("imported", "there"):  # into a new campaign, and into the one that is there
+        result = take(made, folder, "c")
+        assert (result[key], [each["file"] for each in result["failed"]]) == (
+            ["t"],
+            ["a.mcap", "z.mcap"],
+        )
+        assert all("is damaged or cut short" in each["reason"] for each in result["failed"])
+    assert_equal(rich, made)
 
 
 def _ros_bag(

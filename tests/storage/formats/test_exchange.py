@@ -251,7 +251,9 @@ def test_packets_of_any_length(tmp_path: Path, lengths: list[int]) -> None:
     [("x", -1), ("y", 20_000), ("x", 640), *(("t_us", t) for t in (-5, 1 << 60, 1 << 52, 3))],
 )
 def test_one_wrong_event_is_left_out(tmp_path: Path, at: int, column: str, value: int) -> None:
-    reasons = {-5: "without a valid time", 1 << 60: "without a valid time"}
+    reasons = {-5: "with a negative time", 1 << 60: "without a valid time"}
+    # column -1 of a type without a sign is the last one
+    reasons |= {-1: "at a column or row above 16,383", 20_000: "at a column or row above 16,383"}
     reasons |= {1 << 52: "whose times run back", 3: "whose times run back"}
     reason = f"events {reasons.get(value, 'outside of the sensor')}"
     events, _ = _aedat4(tmp_path / "a.aedat4")

@@ -40,6 +40,7 @@ from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5, take, taken
 
 BACK = "events whose times run back"
 NO_TIME = "events without a valid time"
+NEGATIVE = "events with a negative time"
 OUTSIDE = "events outside of the sensor"
 COUNT = 500
 NUMBER = np.arange(COUNT)
@@ -123,7 +124,7 @@ UNKNOWN = "events with an unknown polarity"
 SIGNED = np.where(NUMBER % 3, 1, -1).astype(np.int8)
 WRONG = {
     "t": _with(TIMES, _5=-7, _6=1 << 60),
-    "x": _with(NUMBER % 40, _3=-1, _4=1 << 20, _5=1 << 20),  # wrong twice: counted once
+    "x": _with(NUMBER % 40, _3=-1, _4=1 << 14, _5=1 << 20),  # wrong twice: counted once
     "p": _with(ODD, _4=9),
 }
 SECONDS = NUMBER / 100
@@ -139,7 +140,20 @@ EVENTS: dict[str, tuple[Any, dict[str, Any], Any, Any, dict[str, int]]] = {
     "offset in a list": (_dsec, {"t": NUMBER, "t_offset": [7]}, 7 + NUMBER, None, {}),
     "offset in two": (_dsec, {"t": NUMBER, "t_offset": [[7]]}, 7 + NUMBER, None, {}),
     "minus one": (_dsec, {"t": NUMBER, "p": SIGNED}, NUMBER, SIGNED > 0, {}),
-    "wrong": (_dsec, WRONG, np.delete(TIMES, range(3, 7)), None, {OUTSIDE: 3, NO_TIME: 1}),
+    "wrong": (
+        _dsec,
+        WRONG,
+        np.delete(TIMES, range(3, 7)),
+        None,
+        {OUTSIDE: 1, "events at a column or row above 16,383": 2, NO_TIME: 1},
+    ),
+    "negative": (
+        _dsec,
+        {"t": _with(TIMES, _1=-(1 << 62), _2=-7)},
+        np.delete(TIMES, [1, 2]),
+        None,
+        {NEGATIVE: 1, NO_TIME: 1},
+    ),
     **{
         f"{name} of the lab": (_lab, {"t": SECONDS[rows], "ps": ODD[rows]}, 10**4 * NUMBER, ODD, {})
         for name, rows in (("polarity", BY_SIGN), ("packets", BLOCKS), ("pixel", SHUFFLED))
@@ -225,8 +239,28 @@ def test_a_file_of_many_wrong_events_is_not_imported(tmp_path: Path) -> None:
     _dsec(tmp_path / "a.h5", np.r_[np.full(60, -5), np.arange(COUNT - 60)])
     done = _line(tmp_path, tmp_path / "a.h5")
     assert done.returncode == 2
-    assert f"events: 60 {NO_TIME}; 440 can be right" in done.stderr
+    assert f"events: 60 {NEGATIVE}; 440 can be right" in done.stderr
     assert not (tmp_path / "store").exists()
+
+
+def test_a_sensor_larger_than_any_is_refused_and_not_its_events(tmp_path: Path) -> None:
+    path, most = tmp_path / "a.aedat4", 1 << 14
+    for columns in (most, most + 1):
+        with Aedat4Writer(path, {0: Aedat4Stream("EVTS", "events", (columns, 480), "DVX")}) as file:
+            far = np.full(50, most - 1, np.uint16)
+            file.events(0, EventChunk(far, far % 480, np.ones(50, np.uint8), np.arange(50)))
+        if columns == most:
+            found = _one(tmp_path / "store", path)
+            assert (found.record.geometry.event_px, len(found.events())) == ((most, 480), 50)
+    done = _line(tmp_path / "wide", path)
+    assert done.returncode != 0
+    assert (
+        "states a sensor of 16385 x 480 pixels; read are up to 16,384 columns and rows"
+        in done.stderr
+    )
+    _dsec(tmp_path / "a.h5", t=TIMES, x=NUMBER % 40 + 20_000)
+    done = _line(tmp_path / "far", tmp_path / "a.h5")
+    assert "events: 500 events at a column or row above 16,383; 0 can be right" in done.stderr
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0, 1e30])
@@ -236,7 +270,7 @@ def test_floats_that_are_no_times_are_left_out(tmp_path: Path, wrong: float) -> 
         file["events/ts"][7] = wrong
     found = _one(tmp_path / "store", tmp_path / "a.h5")
     np.testing.assert_array_equal(found.events().t_us, np.delete(whole.t_us, 7))
-    assert _dropped(found) == {NO_TIME: 1}
+    assert _dropped(found) == {NEGATIVE if wrong == -1 else NO_TIME: 1}
 
 
 @pytest.mark.usefixtures("small")
@@ -250,7 +284,7 @@ def test_one_event_before_the_clock_costs_neither_file_nor_folder(tmp_path: Path
     result = take(store, folder)
     assert [len(one.events()) for one in store.campaign("theirs").recordings()] == [2, 2, 2]
     (item,) = result["left_out"]
-    assert (item["trial"], item["left_out"]) == ("d3_s0.5_dir_up_r1", {NO_TIME: 1})
+    assert (item["trial"], item["left_out"]) == ("d3_s0.5_dir_up_r1", {NEGATIVE: 1})
 
 
 @pytest.mark.parametrize("table", [False, True])

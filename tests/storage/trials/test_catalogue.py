@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -253,3 +255,22 @@ def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
     assert here("schema", "trial", "--out", folder / "store.json").returncode == 2
     assert here("trials", folder, "--output", folder / "store.json").returncode == 2
     TrialStore.open(folder)
+
+
+def test_json_keeps_every_digit_and_type(tmp_path: Path) -> None:
+    columns = {
+        "small": np.array([3.2e-12, 1 / 3]),
+        "single": np.array([0.1, 2], np.float32),
+        "missing": [np.nan, np.inf],
+        "late": np.array([2**60 + 1, -5]),
+        "nullable": pd.array([None, 2**60 + 1], "Int64"),
+        "flag": [True, False],
+        "text": ["a/b", None],
+    }
+    write_table(pd.DataFrame(columns), tmp_path / "t.json")
+    rows = json.loads((tmp_path / "t.json").read_text())
+    assert [list(row.values()) for row in rows] == [
+        [3.2e-12, float(np.float32(0.1)), None, 2**60 + 1, None, True, "a/b"],
+        [1 / 3, 2.0, None, -5, 2**60 + 1, False, None],
+    ]
+    assert [type(value) for value in rows[1].values()][-4:] == [int, int, bool, type(None)]
