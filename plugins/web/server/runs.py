@@ -12,7 +12,7 @@ import asyncio
 import contextvars
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -23,6 +23,7 @@ from uuid import UUID
 
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
+from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
 
 MOST_AT_ONCE = 16
 """Requests to the arm that run at the same time."""
@@ -37,13 +38,19 @@ class ServedRuns:
         store: its folder.
         on_rig: the flow of each deployment whose runs go to a process, one at a time.
         control: the flow of each deployment whose runs go to a thread.
+        schedules: those of the service.
     """
 
     def __init__(
-        self, store: Path, on_rig: Mapping[UUID, Any], control: Mapping[UUID, Any]
+        self,
+        store: Path,
+        on_rig: Mapping[UUID, Any],
+        control: Mapping[UUID, Any],
+        schedules: Sequence[Scheduled] = (),
     ) -> None:
         self._store = store
         self._on_rig, self._control = on_rig, control
+        self._schedules = schedules
         self._run: Any = None
         self._asked: Any = None
         self._process: asyncio.subprocess.Process | None = None
@@ -93,7 +100,9 @@ class ServedRuns:
                     threads, context.run, _carry_out_here, flow, run
                 )
             elif run.deployment_id in self._on_rig and self._process is None:
-                await self._begin(client, run)
+                begins = await begin_of_run(run, self._schedules)
+                if begins is None or begins <= datetime.now(UTC):
+                    await self._begin(client, run)
 
     async def _begin(self, client: Any, run: Any) -> None:
         from prefect.client.schemas.responses import SetStateStatus

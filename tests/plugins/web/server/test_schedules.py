@@ -209,6 +209,26 @@ def test_upcoming_runs_are_local_times(
     assert [str(time) for time in found] == runs
 
 
+@pytest.mark.parametrize(
+    ("zone", "cron", "after", "begins"),
+    [
+        (ROME, "30 2 * * *", "2027-03-27T12:00", ["03:30:00+02:00", "02:30:00+02:00"]),
+        (ROME, "0 2 * * *", "2027-03-27T12:00", ["03:00:00+02:00", "02:00:00+02:00"]),
+        (ROME, "30 1 * * *", "2027-03-27T12:00", ["01:30:00+01:00", "01:30:00+02:00"]),
+        (ROME, "30 2 * * *", "2026-10-24T12:00", ["02:30:00+02:00", "02:30:00+01:00"]),
+        ("Australia/Lord_Howe", "15 2 * * *", "2027-10-02T12:00", ["02:45:00+11:00"]),
+    ],
+)
+def test_no_run_begins_earlier_than_written(
+    zone: str, cron: str, after: str, begins: list[str], tmp_path: Path
+) -> None:
+    """Prefect plans an hour that the clocks leave out for the hour before."""
+    path = write(tmp_path, weekly(cron), timezone=zone)
+    moment = datetime.fromisoformat(after).replace(tzinfo=UTC)
+    (found,) = upcoming_runs(path, load_schedules(path), len(begins), moment)
+    assert [str(time)[11:] for time in found] == begins
+
+
 def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
     off = {**weekly("0 3 * * *"), "active": False}
     words = ("serve", write(tmp_path, NIGHT, off), "--store", tmp_path / "store", "--rig", RIG)
