@@ -253,6 +253,11 @@ class Scheduled(StrictModel):
     active: bool
     parameters: dict[str, Any]
 
+    @property
+    def slug(self) -> str:
+        """By which Prefect tells the schedules of one deployment apart; it takes no blanks."""
+        return self.name.replace(" ", "-")
+
     def end(self, begin: datetime) -> datetime | None:
         """The end of the window of a run that is due at `begin`; None without one."""
         until = self.parameters.get("until")
@@ -288,8 +293,9 @@ def load_schedules(path: Path) -> list[Scheduled]:
                 value = each.value and read.written.get(key, each.value)
                 faults.append(InputError(path, key, value, each.expected))
             continue
-        if made[-1].name in {item.name for item in made[:-1]}:
-            faults.append(InputError(path, f"{where}.name", made[-1].name, "is used twice"))
+        if made[-1].slug in {item.slug for item in made[:-1]}:
+            why = "is used twice (blanks count as hyphens)"
+            faults.append(InputError(path, f"{where}.name", made[-1].name, why))
     if faults:
         raise InputError.joined(faults)
     return made

@@ -209,7 +209,7 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
             timezone=item.timezone,
             active=item.active,
             parameters={"wanted": item.parameters},
-            slug=item.name.replace(" ", "-"),
+            slug=item.slug,
         )
         for item in schedules
     ]

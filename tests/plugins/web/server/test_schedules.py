@@ -161,6 +161,9 @@ def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: is used twice"):
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
+    names = ("my night", "my-night")  # Prefect would be given one name for both
+    with pytest.raises(InputError, match=r"schedules\[1\]\.name = my-night: is used twice"):
+        load_schedules(write(tmp_path, *({**copy.deepcopy(NIGHT), "name": n} for n in names)))
     for zone in ("Europe/Rom", "posixrules"):  # the second is this computer's only
         with pytest.raises(InputError, match=f"timezone = {zone}: is not a time zone"):
             load_schedules(write(tmp_path, NIGHT, timezone=zone))
