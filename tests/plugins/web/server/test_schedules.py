@@ -246,6 +246,9 @@ def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
     assert [time[10:19] for time in nights["runs"]] == ["T22:00:00"] * 3
     assert report["runs"] == []
     assert not (tmp_path / "store").exists()
+    none = here("serve", "--store", tmp_path / "store", "--rig", RIG, "--check").stdout
+    assert "no file of schedules" in none
+    assert "None" not in none
 
 
 @pytest.mark.parametrize(
