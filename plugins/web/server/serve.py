@@ -167,7 +167,8 @@ async def _register(
     # one client for all of it: see `page_server.watch`
     async with AsyncClientContext.get_or_create():
         for flow in flows:
-            await _refuse_another(flow.name, here.name, here.folder)
+            if not _has_own_server(here):
+                await _refuse_another(flow.name, here.name, here.folder)
             when = _prefects([item for item in schedules if item.flow == flow.name])
             made = await flow.ato_deployment(
                 deployment_name(flow.name, here.name),
@@ -213,6 +214,15 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
         )
         for item in schedules
     ]
+
+
+def _has_own_server(here: Service) -> bool:
+    """Return whether Prefect's database is the store's, and no other service can share it.
+
+    In a copied or moved store it still calls the old place's deployments ready to run.
+    """
+    home = Path(os.environ["PREFECT_HOME"]).resolve()
+    return here.server == run_records.EMBEDDED and home.parent == here.folder.resolve()
 
 
 async def _refuse_another(flow: str, name: str, store: Path) -> None:

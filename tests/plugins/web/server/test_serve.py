@@ -373,6 +373,28 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
         asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
 
 
+def test_a_moved_store_is_not_taken_for_another(
+    service: Service, server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own database has deployments of its old folder, which are called ready."""
+    from sliplab.plugins.web.server.deployments import label
+
+    here = replace(service, name="moved")
+    asyncio.run(serve._register(here, [], (label,)))
+    page = Page(server.url, server.password, "moved")
+    page.call(
+        "/deployments/get_scheduled_flow_runs", {"deployment_ids": [page.deployment("label")["id"]]}
+    )
+    until("being served", lambda: page.deployment("label")["status"] == "READY")
+    moved = service.folder.rename(tmp_path / "elsewhere")
+    here = replace(here, store=str(moved))
+    with pytest.raises(InputError, match="is served for"):  # a server that stores share
+        asyncio.run(serve._register(here, [], (label,)))
+    monkeypatch.setenv("PREFECT_HOME", str(moved / ".prefect"))
+    asyncio.run(serve._register(here, [], (label,)))
+    assert f"store:{moved}" in page.deployment("label")["tags"]
+
+
 def test_all_deployments_are_registered_by_one_client(
     service: Service, server: EmbeddedServer
 ) -> None:
