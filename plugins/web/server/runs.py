@@ -24,6 +24,7 @@ from uuid import UUID
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
 from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
+from sliplab.plugins.web.server.waiting_runs import is_by_schedule
 
 MOST_AT_ONCE = 16
 """Requests to the arm that run at the same time."""
@@ -100,7 +101,8 @@ class ServedRuns:
                     threads, context.run, _carry_out_here, flow, run
                 )
             elif run.deployment_id in self._on_rig and self._process is None:
-                begins = await begin_of_run(run, self._schedules)
+                by_schedule = is_by_schedule(run)
+                begins = await begin_of_run(run, self._schedules) if by_schedule else None
                 if begins is None or begins <= datetime.now(UTC):
                     await self._begin(client, run)
 

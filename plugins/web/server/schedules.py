@@ -406,7 +406,7 @@ async def begin_of(cron: str, zone: str, planned: datetime) -> datetime | None:
 async def begin_of_run(run: Any, schedules: Sequence[Scheduled]) -> datetime | None:
     """Return when a run of Prefect's begins by the schedule that planned it; None if none did."""
     for item in schedules:
-        if run.auto_scheduled and item.active and run.parameters == {"wanted": item.parameters}:
+        if item.active and run.parameters == {"wanted": item.parameters}:
             begins = await begin_of(item.cron, item.timezone, run.expected_start_time)
             if begins is not None:
                 return begins

@@ -22,6 +22,7 @@ from sliplab.plugins.web.server.page_server import ANSWER_S, PageServer, page_se
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.plugins.web.server.service import Service, deployment_name
+from sliplab.plugins.web.server.waiting_runs import drop_unplanned
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -160,6 +161,7 @@ async def _register(
     Raises:
         InputError: another program serves another store under this name.
     """
+    from prefect.client.orchestration import get_client
     from prefect.context import AsyncClientContext
 
     registered: dict[UUID, Any] = {}
@@ -177,6 +179,8 @@ async def _register(
                 description=flow.description,
             )
             registered[await made.aapply()] = flow
+        async with get_client() as client:
+            await drop_unplanned(client, registered, schedules)
         await _close_stranded(here.name, names, here.folder)
         await _delete_older(here.name, names, here.folder)
     return registered

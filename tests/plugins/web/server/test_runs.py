@@ -57,7 +57,14 @@ def test_a_run_whose_begin_got_no_answer_is_begun(
     """The server took it, and answered too late: it would stay pending, and its night be lost."""
     from prefect.states import Pending, Scheduled
 
-    run = SimpleNamespace(id=uuid4(), deployment_id=uuid4(), state=Scheduled())
+    run = SimpleNamespace(
+        id=uuid4(),
+        deployment_id=uuid4(),
+        state=Scheduled(),
+        run_count=0,
+        auto_scheduled=False,
+        tags=[],
+    )
 
     class Client:
         async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
@@ -103,6 +110,7 @@ def test_a_run_in_an_hour_that_the_clocks_leave_out_waits_for_its_end(
     run = SimpleNamespace(
         id=uuid4(),
         deployment_id=uuid4(),
+        run_count=0,
         auto_scheduled=True,
         parameters={"wanted": {}},
         expected_start_time=at,

@@ -373,6 +373,62 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
         asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
 
 
+def night(name: str, flow: str = "label", **changes: Any) -> Scheduled:
+    """A schedule of every minute."""
+    given = {"cron": "* * * * *", "timezone": "UTC", "active": True, "parameters": {}, **changes}
+    return Scheduled(name=name, flow=flow, **given)
+
+
+def test_what_is_no_longer_in_the_file_of_schedules_runs_no_more(
+    service: Service, server: EmbeddedServer
+) -> None:
+    """Deleted, renamed, moved to another flow, changed or disabled: its late runs go as well."""
+    from sliplab.plugins.web.server.deployments import label, train
+
+    page, here = Page(server.url, server.password, "nights"), replace(service, name="nights")
+    late = (datetime.now(UTC) - timedelta(minutes=5)).replace(second=0, microsecond=0).isoformat()
+
+    def scheduled(flow: str) -> list[str]:
+        return sorted(item["slug"] for item in page.deployment(flow)["schedules"])
+
+    def waiting(flow: str) -> list[tuple[str, ...]]:
+        """The campaigns of all runs of a deployment."""
+        runs = page.call(
+            "/flow_runs/filter",
+            {"flow_runs": {"deployment_id": {"any_": [page.deployment(flow)["id"]]}}},
+        )
+        return sorted({tuple(run["parameters"]["wanted"]["campaigns"]) for run in runs})
+
+    def start(*schedules: Scheduled) -> None:
+        asyncio.run(serve._register(here, schedules, (label, train)))
+
+    def plan(flow: str) -> None:
+        """Plan the last five minutes and the next days, as the server does while nobody serves."""
+        there = page.deployment(flow)["id"]
+        page.call(f"/deployments/{there}/schedule", {"start_time": late, "min_runs": 8})
+
+    def of(name: str) -> dict[str, Any]:
+        return {"parameters": {"campaigns": [name]}}
+
+    a, b = night("a a", **of("a")), night("b", **of("b"))
+    start(a, b)
+    plan("label")
+    assert scheduled("label") == ["a-a", "b"]
+    assert waiting("label") == [("a",), ("b",)]
+    start(b, night("c", "train", **of("c")))
+    plan("train")
+    assert (scheduled("label"), scheduled("train")) == (["b"], ["c"])
+    assert (waiting("label"), waiting("train")) == ([("b",)], [("c",)])
+    start(night("c", **of("c")), night("b", **of("b"), active=False))
+    assert (scheduled("label"), scheduled("train")) == (["b", "c"], [])
+    assert (waiting("label"), waiting("train")) == ([], [])
+    plan("label")
+    assert waiting("label") == [("c",)]
+    start()
+    assert scheduled("label") == []
+    assert waiting("label") == []
+
+
 def test_a_moved_store_is_not_taken_for_another(
     service: Service, server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
