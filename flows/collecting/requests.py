@@ -10,13 +10,13 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.running import console, stopping
+from sliplab.flows.running import console, run_records, stopping
 from sliplab.protocols import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage import process
@@ -30,6 +30,8 @@ from sliplab.storage.trials.migrate import migrate
 from sliplab.storage.trials.store import TrialStore
 
 POLL_S = 0.2
+MOVING = ("collect", "chain", "study")
+"""Names of the flows that move the arm."""
 
 
 class CampaignStopped(RuntimeError):
@@ -85,6 +87,22 @@ def carry_out(store: TrialStore, running: bool = False) -> list[tuple[ControlReq
             did = {"trials": trials, "running": running}
         done.append((request, control.answer(store, request, did)))
     return done
+
+
+def end_if_stopped(store: TrialStore, since: int | None) -> None:
+    """End a run that was stopped while it started or waited: no signal can reach it then.
+
+    Args:
+        since: `RunRequest.since`.
+
+    Raises:
+        KeyboardInterrupt: there is a newer request to stop.
+    """
+    if since is not None and (request := control.stop_after(store, since)) is not None:
+        with suppress(OSError):  # a full disk must not keep the run going
+            control.answer(store, request, {"stopped": True, "running": False})
+        console.say(f"ended before anything moved: {request}")
+        stopping.stop()
 
 
 def refuse_paused(store: TrialStore) -> None:
@@ -209,8 +227,20 @@ def note_stop(
     left = holder_of(store.folder)
     if holder is not None and (left is None or left.get("pid") != holder["pid"]):
         control.answer(store, made, {"stopped": True, "running": True})
+    if waiting := [] if holder is not None else _waiting_runs(store):
+        console.say(f"{', '.join(waiting)}: ends before it moves the arm")
+        control.answer(store, made, {"stopped": True, "running": False, "waiting": waiting})
     _carry_out_if_free(store)
     return RequestOutcome(made, control.answered(store, made), holder)
+
+
+def _waiting_runs(store: TrialStore) -> list[str]:
+    """Return the runs of this machine that may yet move the arm, where none collects."""
+    return [
+        f"{' of '.join(filter(None, [run['flow'], run.get('deployment')]))} ({run['began']})"
+        for run in run_records.open_runs(store.folder)
+        if run["flow"] in MOVING and process.is_here(run.get("process", {}))
+    ]
 
 
 def known_trials(

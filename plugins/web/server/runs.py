@@ -15,6 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
@@ -24,7 +25,10 @@ from uuid import UUID
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
 from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
+from sliplab.plugins.web.server.service import service
 from sliplab.plugins.web.server.waiting_runs import is_by_schedule
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import TrialStore
 
 MOST_AT_ONCE = 16
 """Requests to the arm that run at the same time."""
@@ -54,6 +58,7 @@ class ServedRuns:
         self._schedules = schedules
         self._run: Any = None
         self._asked: Any = None
+        self._since = 0
         self._process: asyncio.subprocess.Process | None = None
         self._stop_by: float | None = None
         self._words: dict[UUID, asyncio.Future[None]] = {}
@@ -110,6 +115,8 @@ class ServedRuns:
         from prefect.client.schemas.responses import SetStateStatus
         from prefect.states import Pending
 
+        # a stop from here on ends it: its process takes seconds to start, and no signal reaches it
+        self._since = control.last_number(TrialStore(self._store))
         self._asked = run  # whose answer may be lost: it would stay pending for ever
         answer = await client.set_flow_run_state(run.id, Pending())
         self._asked = None
@@ -118,10 +125,11 @@ class ServedRuns:
 
     async def _start(self, run: Any) -> None:
         """Start the process of a pending run."""
+        environment = {**os.environ, **replace(service(), since=self._since).environment()}
         command = (sys.executable, "-P", "-m", "sliplab.plugins.web.server.runs", str(run.id))
         self._run, self._stop_by = run, None
         self._process = await asyncio.create_subprocess_exec(
-            *command, self._on_rig[run.deployment_id].name, start_new_session=True
+            *command, self._on_rig[run.deployment_id].name, env=environment, start_new_session=True
         )
 
     async def _supervise(self, client: Any) -> None:
@@ -189,7 +197,6 @@ def _carry_out(run_id: str, flow_name: str) -> None:
     from prefect.settings import temporary_settings
 
     from sliplab.plugins.web.server.deployments import BESIDE, ON_RIG
-    from sliplab.plugins.web.server.service import service
 
     (flow,) = (flow for flow in (*ON_RIG, *BESIDE) if flow.name == flow_name)
     here = service()

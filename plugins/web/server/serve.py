@@ -122,7 +122,7 @@ async def _serve(
     def lane(*of: Sequence[Any]) -> ServedRuns:
         """Return what executes the runs of some flows, by one process at a time."""
         runs = [{run: flow for run, flow in registered.items() if flow in some} for some in of]
-        return ServedRuns(here.folder, *runs, schedules)
+        return ServedRuns(here.folder, runs[0], runs[1], schedules)
 
     lanes = [lane(ON_RIG, CONTROL), lane(BESIDE, ())]
     # a server that does not answer is queried again next time

@@ -37,7 +37,8 @@ async def drop_unplanned(
 
     for deployment, flow in deployments.items():
         ours = [item for item in schedules if item.flow == flow.name]
-        planned, others = [], []
+        planned: list[Any] = []
+        others: list[Any] = []
         for run in await scheduled_runs(client, [deployment]):
             if is_by_schedule(run):
                 # none of those either that were planned before a schedule was changed or disabled

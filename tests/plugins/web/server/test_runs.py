@@ -15,6 +15,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
+from sliplab.flows.collecting import requests
 from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
@@ -140,6 +141,19 @@ def test_a_run_in_an_hour_that_the_clocks_leave_out_waits_for_its_end(
         later = timedelta(minutes=minutes)
         asyncio.run(served._look(client, threads))
         assert begun == expected
+
+
+def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
+    folder = page.log.parent
+    data = tiny()
+    data["name"] = "stopped"
+    protocol = write(folder / "stopped.yaml", data)
+    run = page.run("collect", protocol=str(protocol))["id"]
+    until("its process", lambda: process_of(run), pause_s=0.005)
+    outcome = requests.stop_collection(TrialStore.open(folder / "store"))
+    assert outcome.holder is None  # it does not hold the store yet
+    assert page.ended(run)["type"] == "CANCELLED", page.log.read_text()
+    assert not (folder / "store" / "campaigns" / "stopped" / "trials").exists()
 
 
 def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:

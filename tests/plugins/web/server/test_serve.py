@@ -18,7 +18,7 @@ import yaml
 from sliplab.flows.collecting.progress import sign_rig
 from sliplab.flows.collecting.supervisor import WindowOver
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.running import orchestration, run_records
+from sliplab.flows.running import orchestration, run_records, stopping
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.plugins.claims.document import StoppingRecord
 from sliplab.plugins.web.server import deployments, serve
@@ -36,6 +36,7 @@ from sliplab.plugins.web.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.campaign_end import STOPPING
+from sliplab.storage.trials import control
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -272,6 +273,25 @@ def test_a_rig_that_is_free_again_is_taken(
     answers[:] = [Locked("the rig is in use by anna")]
     with pytest.raises(WindowOver, match="no trial was taken: the rig is in use by anna"):
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
+
+
+def test_a_run_that_waits_for_its_rig_is_stopped(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect
+
+    monkeypatch.setattr(deployments, "POLL_S", 0.01)
+    store = TrialStore.open(service.folder)
+    monkeypatch.setattr(deployments, "_report_waiting", lambda *_: control.ask(store, "stop"))
+    with exclusive(service.folder / ".lock", "the store"):
+        state = collect(Collect(protocol=protocol), return_state=True)
+    assert state.type.value == "CANCELLED"
+    # its process is told which requests there were when the service took it
+    replace(service, since=0).export_environment()
+    state = collect(Collect(protocol=protocol), return_state=True)
+    assert state.type.value == "CANCELLED"
+    assert store.campaign(campaign.NAME).begun is False
+    stopping._requested.clear()
 
 
 def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:
