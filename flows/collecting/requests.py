@@ -25,7 +25,8 @@ from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import ControlRequest, Kind
-from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
+from sliplab.storage.trials.journal import signature
+from sliplab.storage.trials.lock import STORE_LOCK, Locked, current_holder, exclusive
 from sliplab.storage.trials.migrate import migrate
 from sliplab.storage.trials.store import TrialStore
 
@@ -120,11 +121,17 @@ def refuse_paused(store: TrialStore) -> None:
 
 def holder_of(folder: Path) -> Json | None:
     """Return the holder of the lock of the store in `folder`, None if it is not locked."""
+    # by reading alone: a collection must be stopped whose store cannot be written to any more
+    holder = current_holder(folder / STORE_LOCK)
+    if holder and not holder.get("brief"):
+        return holder
     try:
         with exclusive(folder / STORE_LOCK, "the store", brief=True):
             return None
     except Locked as error:
         return error.holder
+    except OSError:
+        return holder
 
 
 def halt(folder: Path) -> tuple[Json | None, bool]:
@@ -210,7 +217,11 @@ def note_stop(
     why: str = "",
     limit_s: float = 60.0,
 ) -> RequestOutcome:
-    """Record a stop whose signal `halt` has sent, and wait until the collection has ended."""
+    """Record a stop whose signal `halt` has sent, and wait until the collection has ended.
+
+    Raises:
+        OSError: it cannot be recorded, and no signal was sent: what may start now is not stopped.
+    """
     if holder is not None and not holder.get("collects"):
         console.say(f"{process.named(holder)}: is not collecting and was not signalled")
         holder = None
@@ -221,12 +232,23 @@ def note_stop(
             else "cannot be signalled; it stops before its next trial"
         )
         console.say(f"{process.named(holder)}: {how}")
-    made = control.ask(store, "stop", who=who, why=why)
+    try:
+        made = control.ask(store, "stop", who=who, why=why)
+    except OSError as error:
+        if not reached:
+            raise
+        console.say(f"signalled, but it could not be logged: {error}")
+        unlogged: Json = {"kind": "stop", **signature(who, why)}
+        made = ControlRequest(number=0, **unlogged)
     if holder is not None and limit_s > 0:
         _wait(store, "waiting for it to stop (s)", limit_s, None)
     left = holder_of(store.folder)
-    if holder is not None and (left is None or left.get("pid") != holder["pid"]):
-        control.answer(store, made, {"stopped": True, "running": True})
+    ended = holder is not None and (left is None or left.get("pid") != holder["pid"])
+    did = {"stopped": True, "running": True}
+    if not made.number:
+        return RequestOutcome(made, {"did": did} if ended else None, holder)
+    if ended:
+        control.answer(store, made, did)
     if waiting := [] if holder is not None else _waiting_runs(store):
         console.say(f"{', '.join(waiting)}: ends before it moves the arm")
         control.answer(store, made, {"stopped": True, "running": False, "waiting": waiting})

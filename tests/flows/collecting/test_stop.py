@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,9 +13,10 @@ from sliplab.flows.collect import collect
 from sliplab.flows.collecting import requests, session
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import run_records, stopping
-from sliplab.storage.trials import control
+from sliplab.storage.trials import control, journal, lock
 from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.crash import campaign as crash
+from tests.storage.holders import holder_of
 
 
 @pytest.fixture(autouse=True)
@@ -21,6 +24,16 @@ def unrequested() -> Iterator[None]:
     """Leave no stop to the tests that follow in this process."""
     yield
     stopping._requested.clear()
+
+
+COLLECTION = """
+import sys
+from pathlib import Path
+from sliplab.storage.trials.lock import exclusive
+with exclusive(Path(sys.argv[1]), "the store", about={"collects": "tiny"}):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
 
 
 def taken(store: TrialStore) -> int:
@@ -73,3 +86,23 @@ def test_stop_names_the_runs_that_it_ends(
     (named,) = outcome.answer["did"]["waiting"]
     assert named.startswith("collect of lab (")
     assert "ends before it moves the arm" in capsys.readouterr().err
+
+
+def test_a_collection_is_stopped_whose_store_cannot_be_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The signal goes out first; that it could not be logged is said."""
+    store = TrialStore.create(tmp_path / "s")
+
+    def read_only(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(store.folder))
+
+    with holder_of(COLLECTION, store.folder / ".lock") as process:
+        monkeypatch.setattr(lock, "_open", read_only)
+        monkeypatch.setattr(journal, "write_new_json", read_only)
+        outcome = requests.stop_collection(store, limit_s=20.0)
+        assert outcome.answer == {"did": {"stopped": True, "running": True}}
+        assert process.wait(timeout=60) == -signal.SIGTERM
+    assert "could not be logged: [Errno 30] Read-only file system" in capsys.readouterr().err
+    with pytest.raises(OSError, match="Read-only"):  # nothing was signalled
+        requests.stop_collection(store)
