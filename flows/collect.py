@@ -13,7 +13,12 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from sliplab.flows.collecting.progress import progress_display
-from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
+from sliplab.flows.collecting.requests import (
+    carry_out,
+    end_if_stopped,
+    refuse_paused,
+    store_lock,
+)
 from sliplab.flows.collecting.session import TrialCollector, open_session, refresh
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import CampaignCounts, RunRequest, check_disk
@@ -99,8 +104,10 @@ def collect(run_request: RunRequest) -> CollectResult:
     Raises:
         CampaignStopped: the store is paused, the disk has no room for the next trial, or
             reference trials drifted apart.
+        KeyboardInterrupt: it was stopped.
     """
     store = TrialStore.create(run_request.store)
+    end_if_stopped(store, run_request.since)
     refuse_paused(store)
     if control.open_requests(store):  # the requester was killed before it carried them out
         with store_lock(store):

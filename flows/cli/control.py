@@ -74,7 +74,9 @@ def stop(
     from sliplab.flows.collecting import requests
 
     outcome = requests.note_stop(opened, *halted, **wanted.arguments())
-    words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
+    words = "stopped: every committed trial is kept"
+    if outcome.holder is None:
+        words = "nothing collects; a run that starts or waits now ends before the arm moves"
     _finish([outcome], as_json, words)
 
 

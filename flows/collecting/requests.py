@@ -10,13 +10,13 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.running import console, stopping
+from sliplab.flows.running import console, run_records, stopping
 from sliplab.protocols import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage import process
@@ -25,11 +25,14 @@ from sliplab.storage.interrupts import uninterrupted
 from sliplab.storage.streams import Json
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import ControlRequest, Kind
-from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
+from sliplab.storage.trials.journal import signature
+from sliplab.storage.trials.lock import STORE_LOCK, Locked, current_holder, exclusive
 from sliplab.storage.trials.migrate import migrate
 from sliplab.storage.trials.store import TrialStore
 
 POLL_S = 0.2
+MOVING = ("collect", "chain", "study")
+"""Names of the flows that move the arm."""
 
 
 class CampaignStopped(RuntimeError):
@@ -87,6 +90,22 @@ def carry_out(store: TrialStore, running: bool = False) -> list[tuple[ControlReq
     return done
 
 
+def end_if_stopped(store: TrialStore, since: int | None) -> None:
+    """End a run that was stopped while it started or waited: no signal can reach it then.
+
+    Args:
+        since: `RunRequest.since`.
+
+    Raises:
+        KeyboardInterrupt: there is a newer request to stop.
+    """
+    if since is not None and (request := control.stop_after(store, since)) is not None:
+        with suppress(OSError):  # a full disk must not keep the run going
+            control.answer(store, request, {"stopped": True, "running": False})
+        console.say(f"ended before anything moved: {request}")
+        stopping.stop()
+
+
 def refuse_paused(store: TrialStore) -> None:
     """Refuse to begin a collection whose store is paused; it would pause at once.
 
@@ -102,11 +121,17 @@ def refuse_paused(store: TrialStore) -> None:
 
 def holder_of(folder: Path) -> Json | None:
     """Return the holder of the lock of the store in `folder`, None if it is not locked."""
+    # by reading alone: a collection must be stopped whose store cannot be written to any more
+    holder = current_holder(folder / STORE_LOCK)
+    if holder and not holder.get("brief"):
+        return holder
     try:
         with exclusive(folder / STORE_LOCK, "the store", brief=True):
             return None
     except Locked as error:
         return error.holder
+    except OSError:
+        return holder
 
 
 def halt(folder: Path) -> tuple[Json | None, bool]:
@@ -192,7 +217,11 @@ def note_stop(
     why: str = "",
     limit_s: float = 60.0,
 ) -> RequestOutcome:
-    """Record a stop whose signal `halt` has sent, and wait until the collection has ended."""
+    """Record a stop whose signal `halt` has sent, and wait until the collection has ended.
+
+    Raises:
+        OSError: it cannot be recorded, and no signal was sent: what may start now is not stopped.
+    """
     if holder is not None and not holder.get("collects"):
         console.say(f"{process.named(holder)}: is not collecting and was not signalled")
         holder = None
@@ -203,14 +232,37 @@ def note_stop(
             else "cannot be signalled; it stops before its next trial"
         )
         console.say(f"{process.named(holder)}: {how}")
-    made = control.ask(store, "stop", who=who, why=why)
+    try:
+        made = control.ask(store, "stop", who=who, why=why)
+    except OSError as error:
+        if not reached:
+            raise
+        console.say(f"signalled, but it could not be logged: {error}")
+        unlogged: Json = {"kind": "stop", **signature(who, why)}
+        made = ControlRequest(number=0, **unlogged)
     if holder is not None and limit_s > 0:
         _wait(store, "waiting for it to stop (s)", limit_s, None)
     left = holder_of(store.folder)
-    if holder is not None and (left is None or left.get("pid") != holder["pid"]):
-        control.answer(store, made, {"stopped": True, "running": True})
+    ended = holder is not None and (left is None or left.get("pid") != holder["pid"])
+    did = {"stopped": True, "running": True}
+    if not made.number:
+        return RequestOutcome(made, {"did": did} if ended else None, holder)
+    if ended:
+        control.answer(store, made, did)
+    if waiting := [] if holder is not None else _waiting_runs(store):
+        console.say(f"{', '.join(waiting)}: ends before it moves the arm")
+        control.answer(store, made, {"stopped": True, "running": False, "waiting": waiting})
     _carry_out_if_free(store)
     return RequestOutcome(made, control.answered(store, made), holder)
+
+
+def _waiting_runs(store: TrialStore) -> list[str]:
+    """Return the runs of this machine that may yet move the arm, where none collects."""
+    return [
+        f"{' of '.join(filter(None, [run['flow'], run.get('deployment')]))} ({run['began']})"
+        for run in run_records.open_runs(store.folder)
+        if run["flow"] in MOVING and process.is_here(run.get("process", {}))
+    ]
 
 
 def known_trials(

@@ -28,7 +28,7 @@ from sliplab.flows.collecting.preparation import (
     preparation_seconds,
     warm_up,
 )
-from sliplab.flows.collecting.requests import carry_out, store_lock
+from sliplab.flows.collecting.requests import carry_out, end_if_stopped, store_lock
 from sliplab.flows.collecting.supervisor import NO_LISTENER, CollectionSupervisor, SessionListener
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
@@ -116,7 +116,9 @@ def open_session(
     """
     store = TrialStore.create(run_request.store)
     with store_lock(store, collects=run_request.campaign):
+        end_if_stopped(store, run_request.since)
         campaign = _recover(store, run_request)
+        end_if_stopped(store, run_request.since)  # by a stop that came before a signal could
         supervisor = CollectionSupervisor(run_request, store, campaign, listener=listener)
         supervisor.begin()
         feed = LiveFeed(run_request)

@@ -34,6 +34,7 @@ from sliplab.protocols.yaml_file import (
 from sliplab.rigs.physics_levels import levels_of, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from sliplab.storage.schema.campaign_end import CampaignEnd
+from sliplab.storage.trials import control
 from sliplab.storage.trials.context import SKIN, LoggedContext
 from sliplab.storage.trials.store import IMPORTED, Campaign, CampaignInfo, StoreError, TrialStore
 
@@ -71,6 +72,8 @@ class RunRequest:
         only: ids of the trials that may be taken; None for all.
         claims: what the protocol's claims do.
         judging_model: file of the network that claims are judged by; None where none needs one.
+        since: number of the last control request when it was made: a later stop ends it before
+            anything moves. None: only a stop during the collection does.
     """
 
     plan: Plan
@@ -85,6 +88,7 @@ class RunRequest:
     only: frozenset[str] | None = None
     claims: Claims = "use"
     judging_model: Path | None = None
+    since: int | None = None
 
     def due_trials(self, campaign: Campaign) -> list[PlannedTrial]:
         """Return the trials to take now, in the plan's order."""
@@ -159,14 +163,20 @@ def make_request(
     most: int | None = None,
     until: float | None = None,
     claims: Claims = "use",
+    since: int | None = None,
 ) -> RunRequest:
     """Read protocol and rig file, and check everything that can be known before anything moves.
+
+    Args:
+        since: as `RunRequest.since`; by default, that of now.
 
     Raises:
         InputError: protocol, rig, or a plan that this rig or this disk cannot take.
         NoStore: the folder holds something else.
         StoreError: the campaign was started under another collection.
     """
+    if since is None:  # before anything that takes long
+        since = control.last_number(TrialStore(store))
     plan = load_plan(protocol, enable, judged=claims != "ignore")
     rig_file, rig_text = load_rig_file(rig)
     check_plan(rig_file, plan, str(rig))
@@ -196,6 +206,7 @@ def make_request(
         until,
         claims=claims,
         judging_model=None if claims == "ignore" else judging_model(plan),
+        since=since,
     )
     if begun:
         _check_same(run_request, begun)

@@ -78,7 +78,8 @@ def serve(
         else:
             rows = [[i.name, i.flow, i.cron, i.timezone, i.active, i.parameters] for i in found]
             columns = ["name", "flow", "cron", "time zone", "active", "parameters"]
-            console.print_table(f"schedules of {schedules}", columns, rows)
+            title = f"schedules of {schedules}" if schedules else "no file of schedules was given"
+            console.print_table(title, columns, rows)
             due = [(time, item) for item, times in zip(found, runs, strict=True) for time in times]
             rows = [
                 [f"{time:{_SHOWN}}", end and f"{end:{_SHOWN}}", item.name, item.flow]

@@ -92,6 +92,19 @@ def requests(store: TrialStore) -> list[ControlRequest]:
     return found
 
 
+def last_number(store: TrialStore) -> int:
+    """Return the number of the last request; 0 if there is none."""
+    return max(_journal(store).numbers(), default=0)
+
+
+def stop_after(store: TrialStore, number: int) -> ControlRequest | None:
+    """Return a stop that was requested after request `number`, answered or not; None without."""
+    if last_number(store) <= number:
+        return None
+    later = (item for item in requests(store) if item.number > number)
+    return next((item for item in later if item.kind == "stop"), None)
+
+
 def answer(store: TrialStore, request: ControlRequest, did: Json) -> Json:
     """Store the result of a request; an existing answer is not replaced."""
     write_new_json(_answer_path(store, request), {"when": now(), "by": user_name(), "did": did})

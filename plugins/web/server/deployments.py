@@ -43,7 +43,7 @@ from sliplab.storage.errors import disk_error
 from sliplab.storage.remote.mirror import open_store
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import StoreError
+from sliplab.storage.trials.store import StoreError, TrialStore
 
 POLL_S = 2.0
 """Interval between attempts to lock a rig that is in use, s."""
@@ -122,9 +122,11 @@ def when_free(
     Raises:
         Locked: one still does after `patience_s`.
         WindowOver: one still does when the window ends.
+        KeyboardInterrupt: a stop was requested since the run was.
     """
     waited = 0.0
     while True:
+        requests.end_if_stopped(TrialStore(run_request.store), run_request.since)
         try:
             return work()
         except Locked as busy:
@@ -239,7 +241,7 @@ CONTROL = (pause, resume, stop)
 def _run_request(
     here: Service, wanted: OnRig, protocol: Path, run: Any, **options: Any
 ) -> RunRequest:
-    given = {"metadata": wanted, **options}
+    given = {"metadata": wanted, "since": here.since, **options}
     run_request = make_request(
         protocol, Path(here.rig), here.folder, until=until_of(wanted, run), **given
     )

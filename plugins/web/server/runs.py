@@ -12,9 +12,10 @@ import asyncio
 import contextvars
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
@@ -23,6 +24,11 @@ from uuid import UUID
 
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
+from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
+from sliplab.plugins.web.server.service import service
+from sliplab.plugins.web.server.waiting_runs import is_by_schedule
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import TrialStore
 
 MOST_AT_ONCE = 16
 """Requests to the arm that run at the same time."""
@@ -37,15 +43,22 @@ class ServedRuns:
         store: its folder.
         on_rig: the flow of each deployment whose runs go to a process, one at a time.
         control: the flow of each deployment whose runs go to a thread.
+        schedules: those of the service.
     """
 
     def __init__(
-        self, store: Path, on_rig: Mapping[UUID, Any], control: Mapping[UUID, Any]
+        self,
+        store: Path,
+        on_rig: Mapping[UUID, Any],
+        control: Mapping[UUID, Any],
+        schedules: Sequence[Scheduled] = (),
     ) -> None:
         self._store = store
         self._on_rig, self._control = on_rig, control
+        self._schedules = schedules
         self._run: Any = None
         self._asked: Any = None
+        self._since = 0
         self._process: asyncio.subprocess.Process | None = None
         self._stop_by: float | None = None
         self._words: dict[UUID, asyncio.Future[None]] = {}
@@ -93,12 +106,17 @@ class ServedRuns:
                     threads, context.run, _carry_out_here, flow, run
                 )
             elif run.deployment_id in self._on_rig and self._process is None:
-                await self._begin(client, run)
+                by_schedule = is_by_schedule(run)
+                begins = await begin_of_run(run, self._schedules) if by_schedule else None
+                if begins is None or begins <= datetime.now(UTC):
+                    await self._begin(client, run)
 
     async def _begin(self, client: Any, run: Any) -> None:
         from prefect.client.schemas.responses import SetStateStatus
         from prefect.states import Pending
 
+        # a stop from here on ends it: its process takes seconds to start, and no signal reaches it
+        self._since = control.last_number(TrialStore(self._store))
         self._asked = run  # whose answer may be lost: it would stay pending for ever
         answer = await client.set_flow_run_state(run.id, Pending())
         self._asked = None
@@ -107,10 +125,11 @@ class ServedRuns:
 
     async def _start(self, run: Any) -> None:
         """Start the process of a pending run."""
+        environment = {**os.environ, **replace(service(), since=self._since).environment()}
         command = (sys.executable, "-P", "-m", "sliplab.plugins.web.server.runs", str(run.id))
         self._run, self._stop_by = run, None
         self._process = await asyncio.create_subprocess_exec(
-            *command, self._on_rig[run.deployment_id].name, start_new_session=True
+            *command, self._on_rig[run.deployment_id].name, env=environment, start_new_session=True
         )
 
     async def _supervise(self, client: Any) -> None:
@@ -178,7 +197,6 @@ def _carry_out(run_id: str, flow_name: str) -> None:
     from prefect.settings import temporary_settings
 
     from sliplab.plugins.web.server.deployments import BESIDE, ON_RIG
-    from sliplab.plugins.web.server.service import service
 
     (flow,) = (flow for flow in (*ON_RIG, *BESIDE) if flow.name == flow_name)
     here = service()

@@ -19,7 +19,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 from zoneinfo import ZoneInfo
@@ -49,6 +49,8 @@ from sliplab.protocols.yaml_file import (
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _UNTIL = re.compile(rf"(?:({'|'.join(DAYS)}) )?{CLOCK}", re.ASCII)
 _NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
+_CHANGE = timedelta(hours=3)
+"""Longest time from a run that was planned too early to the change of the clocks."""
 
 
 Name = Annotated[str, matching(_NAME, "must be letters a-z, digits, blanks, - and _")]
@@ -251,6 +253,11 @@ class Scheduled(StrictModel):
     active: bool
     parameters: dict[str, Any]
 
+    @property
+    def slug(self) -> str:
+        """By which Prefect tells the schedules of one deployment apart; it takes no blanks."""
+        return self.name.replace(" ", "-")
+
     def end(self, begin: datetime) -> datetime | None:
         """The end of the window of a run that is due at `begin`; None without one."""
         until = self.parameters.get("until")
@@ -286,8 +293,9 @@ def load_schedules(path: Path) -> list[Scheduled]:
                 value = each.value and read.written.get(key, each.value)
                 faults.append(InputError(path, key, value, each.expected))
             continue
-        if made[-1].name in {item.name for item in made[:-1]}:
-            faults.append(InputError(path, f"{where}.name", made[-1].name, "is used twice"))
+        if made[-1].slug in {item.slug for item in made[:-1]}:
+            why = "is used twice (blanks count as hyphens)"
+            faults.append(InputError(path, f"{where}.name", made[-1].name, why))
     if faults:
         raise InputError.joined(faults)
     return made
@@ -376,9 +384,41 @@ def upcoming_runs(
     return found
 
 
+async def begin_of(cron: str, zone: str, planned: datetime) -> datetime | None:
+    """Return when a run that Prefect planned begins, UTC; None where the cron line has no such run.
+
+    Prefect plans an hour that a change of the clocks leaves out before that change, an hour early.
+    It begins after it, as a window ends: the arm must not move earlier than is written.
+    """
+    from prefect.server.schemas.schedules import CronSchedule
+
+    wall = planned.astimezone(ZoneInfo(zone))
+    later = (planned + _CHANGE).astimezone(wall.tzinfo)
+    jump = (later.utcoffset() or timedelta()) - (wall.utcoffset() or timedelta())
+    for shift in (timedelta(), max(jump, timedelta())):
+        # by the clock on the wall, where every hour exists
+        shown = wall.replace(tzinfo=UTC) + shift
+        if await CronSchedule(cron=cron, timezone="UTC").get_dates(1, shown) == [shown]:
+            return planned.astimezone(UTC) + shift
+    return None
+
+
+async def begin_of_run(run: Any, schedules: Sequence[Scheduled]) -> datetime | None:
+    """Return when a run of Prefect's begins by the schedule that planned it; None if none did."""
+    for item in schedules:
+        if item.active and run.parameters == {"wanted": item.parameters}:
+            begins = await begin_of(item.cron, item.timezone, run.expected_start_time)
+            if begins is not None:
+                return begins
+    return None
+
+
 def _runs_of(item: Scheduled, count: int, after: datetime | None) -> list[datetime]:
     """Return the next runs of a schedule. Raises KeyedError as `upcoming_runs`."""
     from prefect.server.schemas.schedules import CronSchedule
+
+    async def begins(planned: Sequence[datetime]) -> list[datetime]:
+        return [await begin_of(item.cron, item.timezone, run) or run for run in planned]
 
     try:
         schedule = CronSchedule(cron=item.cron, timezone=item.timezone)
@@ -396,7 +436,8 @@ def _runs_of(item: Scheduled, count: int, after: datetime | None) -> list[dateti
             "is when the window begins, which would last a whole day or week; give another time",
         )
     zone = ZoneInfo(item.timezone)
-    return [datetime.fromtimestamp(run.timestamp(), zone) for run in runs]
+    begun = asyncio.run(begins(runs))
+    return [datetime.fromtimestamp(run.timestamp(), zone) for run in begun]
 
 
 def _ends_as_it_begins(begin: datetime, until: str) -> bool:

@@ -22,6 +22,7 @@ from sliplab.plugins.web.server.page_server import ANSWER_S, PageServer, page_se
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.plugins.web.server.service import Service, deployment_name
+from sliplab.plugins.web.server.waiting_runs import drop_unplanned
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -121,7 +122,7 @@ async def _serve(
     def lane(*of: Sequence[Any]) -> ServedRuns:
         """Return what executes the runs of some flows, by one process at a time."""
         runs = [{run: flow for run, flow in registered.items() if flow in some} for some in of]
-        return ServedRuns(here.folder, *runs)
+        return ServedRuns(here.folder, runs[0], runs[1], schedules)
 
     lanes = [lane(ON_RIG, CONTROL), lane(BESIDE, ())]
     # a server that does not answer is queried again next time
@@ -160,6 +161,7 @@ async def _register(
     Raises:
         InputError: another program serves another store under this name.
     """
+    from prefect.client.orchestration import get_client
     from prefect.context import AsyncClientContext
 
     registered: dict[UUID, Any] = {}
@@ -167,7 +169,8 @@ async def _register(
     # one client for all of it: see `page_server.watch`
     async with AsyncClientContext.get_or_create():
         for flow in flows:
-            await _refuse_another(flow.name, here.name, here.folder)
+            if not _has_own_server(here):
+                await _refuse_another(flow.name, here.name, here.folder)
             when = _prefects([item for item in schedules if item.flow == flow.name])
             made = await flow.ato_deployment(
                 deployment_name(flow.name, here.name),
@@ -176,6 +179,8 @@ async def _register(
                 description=flow.description,
             )
             registered[await made.aapply()] = flow
+        async with get_client() as client:
+            await drop_unplanned(client, registered, schedules)
         await _close_stranded(here.name, names, here.folder)
         await _delete_older(here.name, names, here.folder)
     return registered
@@ -209,10 +214,19 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
             timezone=item.timezone,
             active=item.active,
             parameters={"wanted": item.parameters},
-            slug=item.name.replace(" ", "-"),
+            slug=item.slug,
         )
         for item in schedules
     ]
+
+
+def _has_own_server(here: Service) -> bool:
+    """Return whether Prefect's database is the store's, and no other service can share it.
+
+    In a copied or moved store it still calls the old place's deployments ready to run.
+    """
+    home = Path(os.environ["PREFECT_HOME"]).resolve()
+    return here.server == run_records.EMBEDDED and home.parent == here.folder.resolve()
 
 
 async def _refuse_another(flow: str, name: str, store: Path) -> None:

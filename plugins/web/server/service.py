@@ -30,6 +30,7 @@ class Service:
         protocols: folders below which a run may name its protocol, and files that a schedule names;
             a relative name is of the first.
         urls: of remote stores that schedules name.
+        since: number of the last control request when a run's process was started; of that alone.
     """
 
     store: str
@@ -39,6 +40,7 @@ class Service:
     pid: int
     protocols: tuple[str, ...]
     urls: tuple[str, ...] = ()
+    since: int | None = None
 
     @property
     def folder(self) -> Path:
@@ -47,7 +49,11 @@ class Service:
 
     def export_environment(self) -> None:
         """Export it to the environment of processes that are started from here on."""
-        os.environ[ENVIRONMENT] = json.dumps(asdict(self))
+        os.environ.update(self.environment())
+
+    def environment(self) -> dict[str, str]:
+        """Return it as a variable of the environment."""
+        return {ENVIRONMENT: json.dumps(asdict(self))}
 
     def protocol(self, given: Path) -> Path:
         """Return the protocol file that a run's parameter names.

@@ -6,14 +6,19 @@ import asyncio
 import os
 import signal
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from uuid import UUID, uuid4
+from zoneinfo import ZoneInfo
 
 import pytest
 
+from sliplab.flows.collecting import requests
+from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
+from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.storage.files import read_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials.store import TrialStore
@@ -53,7 +58,14 @@ def test_a_run_whose_begin_got_no_answer_is_begun(
     """The server took it, and answered too late: it would stay pending, and its night be lost."""
     from prefect.states import Pending, Scheduled
 
-    run = SimpleNamespace(id=uuid4(), deployment_id=uuid4(), state=Scheduled())
+    run = SimpleNamespace(
+        id=uuid4(),
+        deployment_id=uuid4(),
+        state=Scheduled(),
+        run_count=0,
+        auto_scheduled=False,
+        tags=[],
+    )
 
     class Client:
         async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
@@ -79,6 +91,69 @@ def test_a_run_whose_begin_got_no_answer_is_begun(
     for _ in range(2):
         asyncio.run(served._look(client, threads))
     assert begun == [run]
+
+
+def test_a_run_in_an_hour_that_the_clocks_leave_out_waits_for_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zone, now = "Europe/Rome", datetime.now(UTC)
+    at = next(
+        moment
+        for hours in range(24 * 366)
+        if (moment := now.replace(minute=30, second=0, microsecond=0) + timedelta(hours=hours))
+        .astimezone(ZoneInfo(zone))
+        .utcoffset()
+        < (moment + timedelta(hours=1)).astimezone(ZoneInfo(zone)).utcoffset()
+    )
+    night = Scheduled(
+        name="n", flow="collect", cron="30 2 * * *", timezone=zone, active=True, parameters={}
+    )
+    run = SimpleNamespace(
+        id=uuid4(),
+        deployment_id=uuid4(),
+        run_count=0,
+        auto_scheduled=True,
+        parameters={"wanted": {}},
+        expected_start_time=at,
+    )
+    begun: list[Any] = []
+
+    class Client:
+        async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
+            return [run]
+
+    async def begin(served: ServedRuns, client: Any, wanted: Any) -> None:
+        begun.append(wanted)
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            return at + later
+
+    monkeypatch.setattr(ServedRuns, "_begin", begin)
+    monkeypatch.setattr(runs, "datetime", Clock)
+    served, client, threads = (
+        ServedRuns(tmp_path, {run.deployment_id: None}, {}, [night]),
+        Client(),
+        None,
+    )
+    for minutes, expected in ((1, []), (59, []), (60, [run])):
+        later = timedelta(minutes=minutes)
+        asyncio.run(served._look(client, threads))
+        assert begun == expected
+
+
+def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
+    folder = page.log.parent
+    data = tiny()
+    data["name"] = "stopped"
+    protocol = write(folder / "stopped.yaml", data)
+    run = page.run("collect", protocol=str(protocol))["id"]
+    until("its process", lambda: process_of(run), pause_s=0.005)
+    outcome = requests.stop_collection(TrialStore.open(folder / "store"))
+    assert outcome.holder is None  # it does not hold the store yet
+    assert page.ended(run)["type"] == "CANCELLED", page.log.read_text()
+    assert not (folder / "store" / "campaigns" / "stopped" / "trials").exists()
 
 
 def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:

@@ -161,6 +161,9 @@ def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: is used twice"):
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
+    names = ("my night", "my-night")  # Prefect would be given one name for both
+    with pytest.raises(InputError, match=r"schedules\[1\]\.name = my-night: is used twice"):
+        load_schedules(write(tmp_path, *({**copy.deepcopy(NIGHT), "name": n} for n in names)))
     for zone in ("Europe/Rom", "posixrules"):  # the second is this computer's only
         with pytest.raises(InputError, match=f"timezone = {zone}: is not a time zone"):
             load_schedules(write(tmp_path, NIGHT, timezone=zone))
@@ -209,6 +212,26 @@ def test_upcoming_runs_are_local_times(
     assert [str(time) for time in found] == runs
 
 
+@pytest.mark.parametrize(
+    ("zone", "cron", "after", "begins"),
+    [
+        (ROME, "30 2 * * *", "2027-03-27T12:00", ["03:30:00+02:00", "02:30:00+02:00"]),
+        (ROME, "0 2 * * *", "2027-03-27T12:00", ["03:00:00+02:00", "02:00:00+02:00"]),
+        (ROME, "30 1 * * *", "2027-03-27T12:00", ["01:30:00+01:00", "01:30:00+02:00"]),
+        (ROME, "30 2 * * *", "2026-10-24T12:00", ["02:30:00+02:00", "02:30:00+01:00"]),
+        ("Australia/Lord_Howe", "15 2 * * *", "2027-10-02T12:00", ["02:45:00+11:00"]),
+    ],
+)
+def test_no_run_begins_earlier_than_written(
+    zone: str, cron: str, after: str, begins: list[str], tmp_path: Path
+) -> None:
+    """Prefect plans an hour that the clocks leave out for the hour before."""
+    path = write(tmp_path, weekly(cron), timezone=zone)
+    moment = datetime.fromisoformat(after).replace(tzinfo=UTC)
+    (found,) = upcoming_runs(path, load_schedules(path), len(begins), moment)
+    assert [str(time)[11:] for time in found] == begins
+
+
 def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
     off = {**weekly("0 3 * * *"), "active": False}
     words = ("serve", write(tmp_path, NIGHT, off), "--store", tmp_path / "store", "--rig", RIG)
@@ -223,6 +246,9 @@ def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
     assert [time[10:19] for time in nights["runs"]] == ["T22:00:00"] * 3
     assert report["runs"] == []
     assert not (tmp_path / "store").exists()
+    none = here("serve", "--store", tmp_path / "store", "--rig", RIG, "--check").stdout
+    assert "no file of schedules" in none
+    assert "None" not in none
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import yaml
 from sliplab.flows.collecting.progress import sign_rig
 from sliplab.flows.collecting.supervisor import WindowOver
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.running import orchestration, run_records
+from sliplab.flows.running import orchestration, run_records, stopping
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.plugins.claims.document import StoppingRecord
 from sliplab.plugins.web.server import deployments, serve
@@ -36,6 +36,7 @@ from sliplab.plugins.web.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.schema.campaign_end import STOPPING
+from sliplab.storage.trials import control
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -274,6 +275,25 @@ def test_a_rig_that_is_free_again_is_taken(
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 
+def test_a_run_that_waits_for_its_rig_is_stopped(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect
+
+    monkeypatch.setattr(deployments, "POLL_S", 0.01)
+    store = TrialStore.open(service.folder)
+    monkeypatch.setattr(deployments, "_report_waiting", lambda *_: control.ask(store, "stop"))
+    with exclusive(service.folder / ".lock", "the store"):
+        state = collect(Collect(protocol=protocol), return_state=True)
+    assert state.type.value == "CANCELLED"
+    # its process is told which requests there were when the service took it
+    replace(service, since=0).export_environment()
+    state = collect(Collect(protocol=protocol), return_state=True)
+    assert state.type.value == "CANCELLED"
+    assert store.campaign(campaign.NAME).begun is False
+    stopping._requested.clear()
+
+
 def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:
     class Run:
         expected_start_time = datetime.now(UTC) - timedelta(days=2)
@@ -371,6 +391,84 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     until("being served", lambda: page.deployment("collect")["status"] == "READY")
     with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
         asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
+
+
+def night(name: str, flow: str = "label", **changes: Any) -> Scheduled:
+    """A schedule of every minute."""
+    given = {"cron": "* * * * *", "timezone": "UTC", "active": True, "parameters": {}, **changes}
+    return Scheduled(name=name, flow=flow, **given)
+
+
+def test_what_is_no_longer_in_the_file_of_schedules_runs_no_more(
+    service: Service, server: EmbeddedServer
+) -> None:
+    """Deleted, renamed, moved to another flow, changed or disabled: its late runs go as well."""
+    from sliplab.plugins.web.server.deployments import label, train
+
+    page, here = Page(server.url, server.password, "nights"), replace(service, name="nights")
+    late = (datetime.now(UTC) - timedelta(minutes=5)).replace(second=0, microsecond=0).isoformat()
+
+    def scheduled(flow: str) -> list[str]:
+        return sorted(item["slug"] for item in page.deployment(flow)["schedules"])
+
+    def waiting(flow: str) -> list[tuple[str, ...]]:
+        """The campaigns of all runs of a deployment."""
+        runs = page.call(
+            "/flow_runs/filter",
+            {"flow_runs": {"deployment_id": {"any_": [page.deployment(flow)["id"]]}}},
+        )
+        return sorted({tuple(run["parameters"]["wanted"]["campaigns"]) for run in runs})
+
+    def start(*schedules: Scheduled) -> None:
+        asyncio.run(serve._register(here, schedules, (label, train)))
+
+    def plan(flow: str) -> None:
+        """Plan the last five minutes and the next days, as the server does while nobody serves."""
+        there = page.deployment(flow)["id"]
+        page.call(f"/deployments/{there}/schedule", {"start_time": late, "min_runs": 8})
+
+    def of(name: str) -> dict[str, Any]:
+        return {"parameters": {"campaigns": [name]}}
+
+    a, b = night("a a", **of("a")), night("b", **of("b"))
+    start(a, b)
+    plan("label")
+    assert scheduled("label") == ["a-a", "b"]
+    assert waiting("label") == [("a",), ("b",)]
+    start(b, night("c", "train", **of("c")))
+    plan("train")
+    assert (scheduled("label"), scheduled("train")) == (["b"], ["c"])
+    assert (waiting("label"), waiting("train")) == ([("b",)], [("c",)])
+    start(night("c", **of("c")), night("b", **of("b"), active=False))
+    assert (scheduled("label"), scheduled("train")) == (["b", "c"], [])
+    assert (waiting("label"), waiting("train")) == ([], [])
+    plan("label")
+    assert waiting("label") == [("c",)]
+    start()
+    assert scheduled("label") == []
+    assert waiting("label") == []
+
+
+def test_a_moved_store_is_not_taken_for_another(
+    service: Service, server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own database has deployments of its old folder, which are called ready."""
+    from sliplab.plugins.web.server.deployments import label
+
+    here = replace(service, name="moved")
+    asyncio.run(serve._register(here, [], (label,)))
+    page = Page(server.url, server.password, "moved")
+    page.call(
+        "/deployments/get_scheduled_flow_runs", {"deployment_ids": [page.deployment("label")["id"]]}
+    )
+    until("being served", lambda: page.deployment("label")["status"] == "READY")
+    moved = service.folder.rename(tmp_path / "elsewhere")
+    here = replace(here, store=str(moved))
+    with pytest.raises(InputError, match="is served for"):  # a server that stores share
+        asyncio.run(serve._register(here, [], (label,)))
+    monkeypatch.setenv("PREFECT_HOME", str(moved / ".prefect"))
+    asyncio.run(serve._register(here, [], (label,)))
+    assert f"store:{moved}" in page.deployment("label")["tags"]
 
 
 def test_all_deployments_are_registered_by_one_client(
