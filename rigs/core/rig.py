@@ -459,6 +459,7 @@ class Rig:
         home = Position(0.0, 0.0, -clearance_mm)
         with self.safely(home):
             out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+            self._turn_back(home)
             self.move(Move("home", home, out_mm_s), self.position(), None)
             self._open_fingers()
             if self._watches_closely:
@@ -692,7 +693,7 @@ class Rig:
             start and end, controller times in ns, and True where it was stopped on the way.
         """
         start = self.arm.now_ns()
-        if seconds == 0 and is_near(self.pose(), segment.to):  # not where the tool leans
+        if seconds == 0:
             return start, start, False
         with self.moving(segment):
             deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
@@ -860,16 +861,25 @@ class Rig:
 
         The sensor is clear of the plate there, so a force sensor is zeroed.
         """
-        if self._twisted:  # an earlier trial ended in its twist
-            here = self.position()
-            left = angle_deg(self.pose(), self.plate_frame.pose(here))
-            self.twist(Twist("untwist", here, UNTWIST_DEG_S), replace(here, twist_deg=left))
-            self._twisted = False
+        self._turn_back(home)
         out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         self.move(Move("home", home, out_mm_s), self.position(), None)
         self.begin_clear(seed, nuisances)
         for device in self.further:
             device.prepare()
+
+    def _turn_back(self, home: Position) -> None:
+        """Turn a turned sensor back on the spot, where the way home is too short to do it there.
+
+        An earlier trial ended in its twist, or an earlier command was stopped in it.
+        """
+        here = self.position()
+        left = angle_deg(self.pose(), self.plate_frame.pose(here))
+        on_way = self.guard.turn_deg_s * here.distance_mm(home) / self.at_most(RETRACT_SPEED_MM_S)
+        if self._twisted or (here.depth_mm <= 0.0 and left > max(_TURN_DEG, on_way)):
+            speed_deg_s = min(UNTWIST_DEG_S, self.guard.turn_deg_s)
+            self.twist(Twist("untwist", here, speed_deg_s), replace(here, twist_deg=left))
+            self._twisted = False
 
     def begin_clear(self, seed: int, nuisances: TrialNuisances | None = None) -> None:
         """Open the fingers, let the simulation draw its random values, zero the force sensor.

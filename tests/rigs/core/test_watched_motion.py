@@ -29,6 +29,7 @@ from sliplab.rigs.core.force_watch import SILENT_S, ForceLimitError
 from sliplab.rigs.core.guard import DepthError, Guard, SpeedError, TiltError, WorkspaceError
 from sliplab.rigs.core.motion_watch import MeasuredSpeedError
 from sliplab.rigs.core.plate_frame import turned_about_z
+from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.reacting import Reflex, SafeState, SenseLost, SlipDetected, run_watched
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.core.teaching import Creep, press_in_circles, touch
@@ -593,13 +594,22 @@ def test_way_out_keeps_the_rotation_that_the_tool_has() -> None:
     assert rig.position().depth_mm < 0.0
 
 
-def test_a_tool_that_leans_is_not_at_its_place() -> None:
-    """A move without a way is made all the same, or the next one would turn the tool in contact."""
+@pytest.mark.parametrize("motion", [trial, watched_trial, warm_up])
+@pytest.mark.parametrize("off_mm", [0.0, 0.5])
+def test_sensor_that_an_earlier_command_left_turned_turns_back(motion: Any, off_mm: float) -> None:
+    """It was stopped in a twist, and moved clear as turned as it was; this is another process."""
     rig = home_rig()
-    arm = with_arm(rig, lambda pose: Pose(pose.xyz_mm, turned_about_z(pose.rotvec_deg, 10.0)))
-    with pytest.raises(SpeedError, match="speed of the turn by 10 deg in a move of 0 mm"):
-        rig.move(Move("home", rig.position(), 10.0), rig.position())
-    assert not arm.started
+    there = replace(HOME, x_mm=off_mm, twist_deg=60.0)
+    rig.arm.start([Segment(rig.plate_frame.pose(replace(there, twist_deg=0.0)), 10.0)])
+    rig.clock.wait(2.0)
+    rig.arm.start([Segment(rig.plate_frame.pose(there), 10.0, 20.0)])
+    rig.clock.wait(5.0)
+    assert angle_deg(rig.pose(), rig.plate_frame.pose(HOME)) == pytest.approx(60.0, abs=0.5)
+    arm = with_arm(rig)
+    motion(rig)
+    assert arm.started[0].turn_deg_s == 20.0
+    assert arm.started[0].to.xyz_mm == pytest.approx(rig.plate_frame.pose(there).xyz_mm, abs=0.1)
+    assert not any(segment.turn_deg_s for segment in arm.started[1:])
 
 
 def replace_limits(rig: Rig, **change: float) -> Any:
