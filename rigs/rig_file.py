@@ -132,7 +132,7 @@ class ReflexSettings(StrictModel):
     def _senses_are_missed_soon(self) -> Iterator[KeyedError]:
         for name in ("stream_timeout", "decision_timeout"):
             if (seconds := getattr(self, name)) > LONGEST_TIMEOUT_S:
-                text = f"must be at most {LONGEST_TIMEOUT_S} s: so long a lost sense would go unnoticed"
+                text = f"must be at most {LONGEST_TIMEOUT_S} s, or a lost sense goes unnoticed"
                 yield KeyedError(f".{name}", f"{seconds} s", text)
 
 
