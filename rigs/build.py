@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from sliplab.protocols.timing import ForceTiming
@@ -69,7 +71,27 @@ def build_rig(file: RigFile, should_stop: ShouldStop = never) -> Rig:
     need_video(file)
     if file.devices is not None:
         need_libraries(file.devices, file.streams)
-    return find_driver(file.driver, RigDriver).build(file, should_stop)
+    rig = find_driver(file.driver, RigDriver).build(file, should_stop)
+    if not file.in_virtual_time:
+        rig.on_close = (_stop_on_suspension(), *rig.on_close)
+    return rig
+
+
+def _stop_on_suspension() -> Callable[[], None]:
+    """Let Ctrl-Z do what Ctrl-C does, until the function that is returned is called.
+
+    A suspended program watches no arm. Only the main thread can answer signals; in another one
+    nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return lambda: None
+    before = signal.signal(signal.SIGTSTP, lambda *_: signal.raise_signal(signal.SIGINT))
+
+    def restore() -> None:
+        with suppress(ValueError):  # closed in another thread
+            signal.signal(signal.SIGTSTP, signal.SIG_DFL if before is None else before)
+
+    return restore
 
 
 def taught_frame(file: RigFile) -> PlateFrame:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import sys
 import threading
 from collections import Counter
@@ -245,6 +246,7 @@ def _serve(
 ) -> None:
     """Run the process; it ends with its parent, without waiting for libraries to shut down."""
     leave_to_parent()
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # Ctrl-Z, which stops the arm in the parent
     from sliplab.plugins.loopback.simulation_server import SimulationServer
 
     sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes

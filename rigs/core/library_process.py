@@ -104,10 +104,21 @@ class PipeCalls:
         with self._lock:
             return self._answer(within_s)
 
+    def tell(self, message: Any) -> None:
+        """Send a message that gets no answer; not while a call is waited for. Raises OSError."""
+        if self._lock.acquire(blocking=False):
+            try:
+                self.pipe.send(message)
+            finally:
+                self._lock.release()
+
     def close(self) -> None:
         """Close the pipe; safe to call more than once."""
         self._closed.set()
+        told = self._lock.acquire(timeout=STEP_S)  # or `tell` might write to what is opened next
         self.pipe.close()
+        if told:
+            self._lock.release()
 
     def end_late(self, stall: StallTimer) -> None:
         """End the child if its answer has begun and does not end in time; call it regularly."""

@@ -380,3 +380,24 @@ def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> 
     guaranteed_s = 1 / settings.WATCHDOG_HZ if whole else 0.5
     assert way_mm < 20.0 * (guaranteed_s + 1.0)
     print(f"{'both' if whole else 'program'} killed at 20 mm/s: {way_mm:.2f} mm")
+
+
+def test_the_arm_of_a_suspended_program_stops(robot_of: MakeRobot) -> None:
+    """The control client lives on, and would keep the controller's watchdog content."""
+    robot = robot_of()
+    arm_settings = ur_settings(robot.host).model_dump_json()
+    program = subprocess.Popen(
+        [sys.executable, "-c", DRIVES, arm_settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert program.stdin is not None
+    with program.stdout, program.stdin:
+        program.stdout.readline()
+        until(lambda: robot.pose().xyz_mm[1] > 2.0, 5.0)
+        try:
+            program.send_signal(signal.SIGSTOP)
+            suspended_mm = robot.pose().xyz_mm[1]
+            until(lambda: not robot.moving(), ur_control.SILENT_S + BUSY_S)
+            assert robot.pose().xyz_mm[1] - suspended_mm < 20.0 * (ur_control.SILENT_S + 1.0)
+        finally:
+            program.kill()
+        program.wait(5.0)
