@@ -7,11 +7,11 @@ numpy's arrays, read column by column.
 
 from __future__ import annotations
 
-import codecs
 import csv
 import io
 import json
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -32,6 +32,11 @@ MOST_TABLE = 1 << 26
 _MOST_CELLS = 1 << 14
 """Cells of a row."""
 _SEPARATORS = "\t;, "
+_PACKED, _UTF_16 = (b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0"), (BOM_UTF16_LE, BOM_UTF16_BE)
+"""First bytes of workbooks and compressed files, and of texts in UTF-16."""
+_UNPACK = "is a workbook or compressed: save it as CSV, unpacked"
+_ONLY_CR = "has lines that end in CR alone: save it with LF or CRLF"
+_EMPTY = "is empty; its first line names the columns"
 _QUOTED = re.compile('"[^"]*"')
 _BLOCK_BYTES, _ROWS = 1 << 21, 1 << 18
 """Bytes of CSV and rows of numpy's arrays that are read at once."""
@@ -119,9 +124,9 @@ def table_text(place: str, data: bytes) -> str:
     if len(data) > MOST_TABLE:
         text = f"is larger than {MOST_TABLE >> 20} MiB: leave out rows and columns without use"
         raise InputError(place, "", None, text)
-    if data.startswith((b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
-        raise InputError(place, "", None, "is a workbook or compressed: save it as CSV, unpacked")
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if data.startswith(_PACKED):
+        raise InputError(place, "", None, _UNPACK)
+    wide = data.startswith(_UTF_16)
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
@@ -174,6 +179,8 @@ def rows_of_csv(
     Raises:
         InputError: it is damaged, empty, names a column twice, or has a row of another length.
     """
+    if "\r" in text and "\n" not in text:
+        raise InputError(place, "", None, _ONLY_CR)
     lines = (line for line in text.split("\n") if line.strip())
     separator = _separator(next(lines, ""))
     if separator == " " and " " not in next(lines, " ").strip():
@@ -207,7 +214,7 @@ def rows_of_csv(
     except csv.Error as error:
         raise InputError(place, f"row {reader.line_num}", None, f"is not CSV: {error}") from None
     if columns is None:
-        raise InputError(place, "", None, "is empty; its first line names the columns")
+        raise InputError(place, "", None, _EMPTY)
     return columns, rows
 
 
@@ -284,7 +291,17 @@ def _column(there: Mapping[str, Any], column: str | int) -> Any:
 def _csv_chunks(
     data: Any, columns: Mapping[str, str | int]
 ) -> Iterator[tuple[dict[str, Any], int]]:
-    lines = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace").split("\n")
+    head = bytes(data[: 1 << 16])
+    for fault, wrong in (
+        (_UNPACK, head.startswith(_PACKED)),
+        ("is UTF-16 text: save it as UTF-8", head.startswith(_UTF_16)),
+        (_ONLY_CR, b"\r" in head and b"\n" not in head),
+        ("is no text", b"\0" in head),
+        (_EMPTY, not head.strip()),
+    ):
+        if wrong:
+            raise FormatError(fault)
+    lines = head.decode("utf-8-sig", "replace").split("\n")
     separator = _separator(lines[0])
     # the first row of numbers may have more cells than the heading
     cells, second = (
