@@ -477,7 +477,10 @@ def test_one_trial_with_a_fault_leaves_the_others(tmp_path: Path, fault: str) ->
     (failed,) = result["failed"]
     assert failed["trial"] == bad
     assert reason in failed["reason"]
-    assert len(result["imported"]) == 3
+    assert len(result["imported"]) == sum(result["split"].values()) == 3
+    done = here(*line, "--store", tmp_path / "store", "--json")
+    again = json.loads(done.stdout)
+    assert (again["there"], again["split"]) == (result["imported"], result["split"])
 
 
 @pytest.mark.parametrize("change", [-2, 1])
