@@ -473,7 +473,9 @@ class Model:
 
         self.fitted.check_slip("model", "a prediction of slip")
         windows = store.windows(split)
-        counts = training.predict_counts(self.fitted, store._counts(windows, self.fitted.windows))
+        # the network may have windows of another length than the store
+        starts = windows.drop(columns="end_ns")
+        counts = training.predict_counts(self.fitted, store._counts(starts, self.fitted.windows))
         columns = dict(zip(COLUMNS["spikes"], counts.T, strict=True))
         return windows[["campaign", "trial", "start_ns"]].assign(**columns)
 

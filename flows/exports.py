@@ -17,7 +17,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.plugins import PluginError, import_foreign
 from sliplab.protocols.shown import one_of
-from sliplab.storage.errors import StoreError
+from sliplab.storage.errors import StoreError, disk_error, disk_full
 
 if TYPE_CHECKING:
     from sliplab.storage.trials.store import Campaign, TrialStore
@@ -157,7 +157,13 @@ def export(request: ExportRequest) -> ExportResult:
     refuse_store_file(request.output, "--output", again=again)
     if form.of != "model":
         request = replace(request, place=str(located(request.place)))
-    return form.write(request)
+    try:
+        return form.write(request)
+    except OSError as error:
+        if form.of == "model" or not disk_full(error):
+            raise
+        # of the store nothing was written: there is nothing to resume
+        raise disk_error(request.output, error, "export again") or error from None
 
 
 def _chosen(request: ExportRequest) -> tuple[TrialStore, Campaign, list[str]]:

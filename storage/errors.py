@@ -92,8 +92,15 @@ def own_fault(error: Exception) -> bool:
     return isinstance(error, OSError) and error.errno in _OWN_FAULTS
 
 
-def disk_error(folder: Path, error: BaseException) -> StoreError | None:
-    """Translate an error that came from the disk under `folder`; None for any other error."""
+_GO_ON = "run the same command to resume; every committed trial is kept"
+
+
+def disk_error(folder: Path, error: BaseException, then: str = _GO_ON) -> StoreError | None:
+    """Translate an error that came from the disk under `folder`; None for any other error.
+
+    Args:
+        then: what is to be done once the fault is gone.
+    """
     fault = disk_fault(error)
     if fault is None:
         return None
@@ -102,10 +109,7 @@ def disk_error(folder: Path, error: BaseException) -> StoreError | None:
         there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         fault += f" ({shutil.disk_usage(there).free / 1e9:.1f} GB free)"
         todo = "make room"
-    return StoreError(
-        f"{folder}: its disk {fault}: {todo}, then run the same command to resume; every "
-        "committed trial is kept"
-    )
+    return StoreError(f"{folder}: its disk {fault}: {todo}, then {then}")
 
 
 @contextmanager

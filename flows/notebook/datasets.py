@@ -42,8 +42,9 @@ def _by_trial(
     """Return each trial's recording, and its rows in `windows`.
 
     Raises:
-        InputError: with all faults: a column that is missing, a time or a label that is none, a
-            trial that the store lacks, a window outside of the recording.
+        InputError: with all faults: a column that is missing, a time or a label that is none, an
+            end that is of another length, a trial that the store lacks, a window outside of the
+            recording.
     """
     faults = [
         InputError("windows", name, None, "is missing; `Store.windows` makes the table")
@@ -61,6 +62,18 @@ def _by_trial(
             row = int(np.flatnonzero(~good)[0])
             text = f"{right}; not so in {plural(int((~good).sum()), 'row')}"
             faults.append(InputError("windows", f"{name}[{row}]", windows[name].iloc[row], text))
+    if "end_ns" in windows.columns:
+        ends, whole_ends = whole_ns(windows["end_ns"])
+        wrong = whole & ~(whole_ends & (ends == starts + length_ns))
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            text = (
+                f"must be {starts[row] + length_ns}: windows of the store have "
+                f"{length_ns / 1e6:g} ms; not so in {plural(int(wrong.sum()), 'row')}"
+            )
+            faults.append(
+                InputError("windows", f"end_ns[{row}]", windows["end_ns"].iloc[row], text)
+            )
     found = {}
     for (campaign, trial), rows in windows.groupby(
         ["campaign", "trial"], sort=False, dropna=False

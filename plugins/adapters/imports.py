@@ -51,6 +51,7 @@ def import_adapted(
                 )
             say_faults(result)
             warnings += result.get("warnings", ())
+            parts = {trial: parts[trial] for trial in (*result["imported"], *result["there"])}
         return result | {
             "split": dict(Counter(parts.values())),
             "warnings": warnings,

@@ -114,10 +114,9 @@ def _ns_of(times: ArrayLike, name: str, unit: str | None) -> Ints:
     if array.ndim != 1 or array.dtype.kind not in "iuf":
         raise InputError(name, "", None, "must be one row of numbers: seconds, or integers in ns")
     factor = TIME_UNITS[unit or ("s" if array.dtype.kind == "f" else "ns")]
-    if array.dtype.kind == "f":
-        if not np.isfinite(array).all():
-            bad = int(np.flatnonzero(~np.isfinite(array))[0])
-            raise InputError(name, f"[{bad}]", float(array[bad]), "must be a finite time")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        bad = int(np.flatnonzero(~np.isfinite(array))[0])
+        raise InputError(name, f"[{bad}]", float(array[bad]), "must be a finite time")
     scaled = array.astype(np.longdouble) * factor  # to judge integers before they overflow
     if scaled.size and np.abs(scaled).max() >= _MOST_NS:
         raise InputError(name, "", None, "has times too large for int64 ns: check their unit")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import pandas as pd
@@ -44,30 +45,43 @@ def export_trials(
     """
     how = known_format(kind)
     assert how.export is not None
-    ours = {item["file"] for item in (read_manifest(folder) or {"trials": ()})["trials"]}
+    earlier = read_manifest(folder) or {"trials": (), "simulated": False}
+    ours = {item["file"]: item for item in earlier["trials"]}
     paths = [folder / f"{recording.trial_id}{how.suffixes[0]}" for recording in recordings]
     for path in paths:
         if path.name not in ours and os.path.lexists(path):  # perhaps the only original
             text = f"is not in {EXPORT_MANIFEST} and is not replaced; name a new folder"
             raise InputError("--output", "", str(path), text)
     make_folder(folder)
-    listed: list[Json] = []
-    for recording, path in zip(recordings, paths, strict=True):
-        on_trial(recording.trial_id)
-        try:
-            with replacing(path) as temporary:
-                counts = how.export(recording, temporary, stream)
-        except StoreError:  # a damaged trial, some of which are ValueErrors, too
-            raise
-        except ValueError as error:
-            raise InputError("--as", "", kind, f"trial {recording.trial_id} {error}") from None
-        listed.append(_listed(recording, path.name, counts))
-    sync_folder(folder)
-    simulated = any(recording.simulated for recording in recordings)
-    about: Json = {"campaign": campaign, "format": kind, "simulated": simulated, "trials": listed}
+    about: Json = {
+        "sliplab_export": EXPORT_FORMAT,
+        "campaign": campaign,
+        "format": kind,
+        "simulated": any(recording.simulated for recording in recordings),
+    }
     if stream != EVENTS_KIND:
         about["stream"] = stream
-    write_json(folder / EXPORT_MANIFEST, {"sliplab_export": EXPORT_FORMAT, **about})
+    listed: list[Json] = []
+    try:
+        for recording, path in zip(recordings, paths, strict=True):
+            on_trial(recording.trial_id)
+            try:
+                with replacing(path) as temporary:
+                    counts = how.export(recording, temporary, stream)
+            except StoreError:  # a damaged trial, some of which are ValueErrors, too
+                raise
+            except ValueError as error:
+                raise InputError("--as", "", kind, f"trial {recording.trial_id} {error}") from None
+            listed.append(_listed(recording, path.name, counts))
+    except BaseException:
+        if listed:  # the next export may replace what is there by now
+            about["simulated"] |= earlier["simulated"]
+            about["trials"] = [*(ours | {item["file"]: item for item in listed}).values()]
+            with suppress(OSError):
+                write_json(folder / EXPORT_MANIFEST, about)
+        raise
+    sync_folder(folder)
+    write_json(folder / EXPORT_MANIFEST, about | {"trials": listed})
     totals = {name: sum(item[name] for item in listed) for name in ("events", "frames", "triggers")}
     return {"trials": len(listed), **totals, "files": [item["file"] for item in listed]}
 

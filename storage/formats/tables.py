@@ -7,11 +7,11 @@ numpy's arrays, read column by column.
 
 from __future__ import annotations
 
-import codecs
 import csv
 import io
 import json
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -32,9 +32,16 @@ MOST_TABLE = 1 << 26
 _MOST_CELLS = 1 << 14
 """Cells of a row."""
 _SEPARATORS = "\t;, "
+_PACKED, _UTF_16 = (b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0"), (BOM_UTF16_LE, BOM_UTF16_BE)
+"""First bytes of workbooks and compressed files, and of texts in UTF-16."""
+_UNPACK = "is a workbook or compressed: save it as CSV, unpacked"
+_ONLY_CR = "has lines that end in CR alone: save it with LF or CRLF"
+_EMPTY = "is empty; its first line names the columns"
 _QUOTED = re.compile('"[^"]*"')
 _BLOCK_BYTES, _ROWS = 1 << 21, 1 << 18
 """Bytes of CSV and rows of numpy's arrays that are read at once."""
+_LARGE = 1 << 53
+"""From here on a float of 64 bits is not every whole number."""
 _TOO_WIDE = re.compile(r"Expected \d+ fields in line (\d+), saw (\d+)")
 
 
@@ -117,9 +124,9 @@ def table_text(place: str, data: bytes) -> str:
     if len(data) > MOST_TABLE:
         text = f"is larger than {MOST_TABLE >> 20} MiB: leave out rows and columns without use"
         raise InputError(place, "", None, text)
-    if data.startswith((b"PK", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
-        raise InputError(place, "", None, "is a workbook or compressed: save it as CSV, unpacked")
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if data.startswith(_PACKED):
+        raise InputError(place, "", None, _UNPACK)
+    wide = data.startswith(_UTF_16)
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
@@ -172,6 +179,8 @@ def rows_of_csv(
     Raises:
         InputError: it is damaged, empty, names a column twice, or has a row of another length.
     """
+    if "\r" in text and "\n" not in text:
+        raise InputError(place, "", None, _ONLY_CR)
     lines = (line for line in text.split("\n") if line.strip())
     separator = _separator(next(lines, ""))
     if separator == " " and " " not in next(lines, " ").strip():
@@ -205,7 +214,7 @@ def rows_of_csv(
     except csv.Error as error:
         raise InputError(place, f"row {reader.line_num}", None, f"is not CSV: {error}") from None
     if columns is None:
-        raise InputError(place, "", None, "is empty; its first line names the columns")
+        raise InputError(place, "", None, _EMPTY)
     return columns, rows
 
 
@@ -214,7 +223,19 @@ def read_columns(
 ) -> tuple[dict[str, Any], int]:
     """Read all rows of `column_chunks` at once; return them and the number of rows left out."""
     chunks, left_out = zip(*column_chunks(folder, name, form, columns), strict=True)
-    return {key: np.concatenate([c[key] for c in chunks]) for key in columns}, sum(left_out)
+    return {key: _joined([chunk[key] for chunk in chunks]) for key in columns}, sum(left_out)
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Join parts of a column: whole numbers that a float cannot hold stay exact beside floats."""
+    large = any(len(part) and part.dtype.kind in "iu" and _is_large(part) for part in parts)
+    floats = any(len(part) and part.dtype.kind == "f" for part in parts)
+    return np.concatenate(parts, dtype=np.longdouble if large and floats else None)
+
+
+def _is_large(numbers: Any) -> bool:
+    """Return whether some numbers are so large that not every whole one is a float of 64 bits."""
+    return bool(numbers.max() >= _LARGE or numbers.min() <= -_LARGE)
 
 
 def column_chunks(
@@ -270,7 +291,17 @@ def _column(there: Mapping[str, Any], column: str | int) -> Any:
 def _csv_chunks(
     data: Any, columns: Mapping[str, str | int]
 ) -> Iterator[tuple[dict[str, Any], int]]:
-    lines = bytes(data[: 1 << 16]).decode("utf-8-sig", "replace").split("\n")
+    head = bytes(data[: 1 << 16])
+    for fault, wrong in (
+        (_UNPACK, head.startswith(_PACKED)),
+        ("is UTF-16 text: save it as UTF-8", head.startswith(_UTF_16)),
+        (_ONLY_CR, b"\r" in head and b"\n" not in head),
+        ("is no text", b"\0" in head),
+        (_EMPTY, not head.strip()),
+    ):
+        if wrong:
+            raise FormatError(fault)
+    lines = head.decode("utf-8-sig", "replace").split("\n")
     separator = _separator(lines[0])
     # the first row of numbers may have more cells than the heading
     cells, second = (
@@ -355,18 +386,16 @@ class _Csv:
             raise self._too_wide(len(self.cells) + last + 1, line or first_row + at)
         for index in self.wanted.values():
             good &= pd.to_numeric(table[index], errors="coerce").notna().to_numpy()
-        if good.all() or (is_first and 2 * int(good.sum()) <= len(good)):
-            found = {key: table[index].to_numpy() for key, index in self.wanted.items()}
-        elif not good.any():
+        found = {key: table[index].to_numpy() for key, index in self.wanted.items()}
+        if not good.any() and not is_first:
             return {key: np.empty(0, np.int64) for key in self.wanted}, len(table)
-        else:  # as text: an empty cell makes floats of whole numbers
+        inexact = any(each.dtype.kind == "f" and _is_large(each) for each in found.values())
+        if (inexact or not good.all()) and not (is_first and 2 * int(good.sum()) <= len(good)):
+            # as text: an empty cell, or one with a point, makes floats of whole numbers
             _, words = self._table(
                 block, int(is_first and self.headed), dict.fromkeys(self.wanted.values(), str)
             )
-            words = words[good]
-            found = {
-                key: pd.to_numeric(words[index]).to_numpy() for key, index in self.wanted.items()
-            }
+            found = {key: _exact(words[index][good]) for key, index in self.wanted.items()}
         rows = {key: _numbers(v, self.columns[key], first_row) for key, v in found.items()}
         return rows, len(table) - len(next(iter(rows.values())))
 
@@ -419,6 +448,14 @@ def _cells(lines: list[str], separator: str) -> list[str]:
         raise FormatError(f"is not CSV: {error}") from None
 
 
+def _exact(words: pd.Series) -> Any:
+    """Return numbers from their text, large ones that are not all whole with 64 bits of digits."""
+    numbers = pd.to_numeric(words).to_numpy()
+    if numbers.dtype.kind == "f" and _is_large(numbers):
+        return words.str.strip().to_numpy(np.str_).astype(np.longdouble)
+    return numbers
+
+
 def _numbers(column: Any, name: str | int, first_row: int) -> Any:
     if column.dtype.kind not in "iufb":
         at = next((k for k, value in enumerate(column) if not _is_number(str(value))), 0)
@@ -455,7 +492,8 @@ def times_ns(times: Any, unit: str) -> I64:
         good = (times < limit) & (times > -limit if times.dtype.kind == "i" else True)
     times = np.where(good, times, 0)
     if times.dtype.kind == "f":
-        found = np.asarray(np.rint(times.astype(np.float64) * factor), np.int64)
+        exact = times if times.dtype == np.longdouble else times.astype(np.float64)
+        found = np.asarray(np.rint(exact * factor), np.int64)
     else:
         found = np.asarray(times, np.int64) * factor
     return np.where(good, found, NO_TIME_NS)

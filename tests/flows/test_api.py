@@ -282,6 +282,18 @@ def test_windows_are_items_of_torch_and_of_tonic(store: sliplab.Store) -> None:
     with pytest.raises(sliplab.InputError, match="windows: start_ns: is missing"):
         store.torch_dataset(windows=windows.drop(columns="start_ns"))
     few = windows.head(4)
+    right = int(few["start_ns"].iloc[2]) + 30_000_000
+    for wrong_end, count in ((right + 1, 1), (None, 1), (few["start_ns"], 4)):
+        wrong = few.copy()
+        wrong.loc[few.index[2] if count == 1 else few.index, "end_ns"] = wrong_end
+        row = 2 if count == 1 else 0
+        first = int(few["start_ns"].iloc[row]) + 30_000_000
+        for dataset in (store.torch_dataset, store.tonic_dataset):
+            with pytest.raises(sliplab.InputError) as caught:
+                dataset(windows=wrong)
+            assert f"windows: end_ns[{row}] = " in str(caught.value)
+            assert f"must be {first}: windows of the store have 30 ms" in str(caught.value)
+    assert len(store.torch_dataset(windows=few.drop(columns="end_ns"))) == 4
     wrong = few.assign(start_ns=[math.nan, 0.5, 1e30, 1 << 60], label=[None, "slip", None, None])
     wrong["trial"] = ["nobody", *wrong["trial"][1:]]
     for dataset in (store.torch_dataset, store.tonic_dataset):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,10 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
+from sliplab.storage.formats import export_trials as _exports
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import StoreError, TrialStore
 from tests.command_line import here, outcome
 from tests.conftest import ROOT
@@ -254,3 +258,31 @@ def test_exports_replace_no_original_and_nothing_of_a_store(tmp_path: Path) -> N
         assert [here(*asked, place).returncode for _ in range(2)] == [0, 0]
     (out / "sliplab-export.json").unlink()
     assert here(*asked, out).returncode == 2
+
+
+def test_an_export_that_was_stopped_may_be_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, out = tmp_path / "store", tmp_path / "out"
+    where = campaign(store)
+    for trial in ("a", "b"):
+        commit(where, trial)
+    asked = ("export", store, "c", "--as", "dsec", "--output", out)
+    with monkeypatch.context() as patch:
+        export = _exports.known_format("dsec").export
+
+        def full(recording: Recording, path: Path, stream: str) -> dict[str, int]:
+            if recording.trial_id == "b":
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return export(recording, path, stream)
+
+        known = replace(_exports.known_format("dsec"), export=full)
+        patch.setattr(_exports, "known_format", lambda kind: known)
+        done = here(*asked)
+    assert done.returncode == 1
+    said = " ".join(done.stderr.split())
+    assert f"{out}: its disk is full" in said
+    assert "make room, then export again" in said
+    assert "resume" not in said
+    assert [here(*asked).returncode for _ in range(2)] == [0, 0]
+    assert {path.name for path in out.glob("*.h5")} == {"a.h5", "b.h5"}

@@ -437,6 +437,27 @@ def test_large_whole_numbers_beside_a_bad_row_stay_exact(tmp_path: Path) -> None
     assert (found["t"].tolist(), left_out) == ([1700000000000000001, 1700000000000000003], 1)
 
 
+@pytest.mark.parametrize("blocks", [1, 2])
+@pytest.mark.parametrize("cell", ["{}.0", " {}.5", "{}.0e0"])
+def test_large_whole_numbers_beside_a_float_stay_exact(
+    tmp_path: Path, monkeypatch: Any, blocks: int, cell: str
+) -> None:
+    from sliplab.storage.formats import tables
+    from sliplab.storage.formats.data_folder import DataFolder
+
+    monkeypatch.setattr(tables, "_BLOCK_BYTES", 1 << 21 if blocks == 1 else 200)
+    times = 1_700_000_000_123_456_789 + 1_000_001 * np.arange(100)
+    rows = [f"{t},{t}" for t in times]
+    rows[90] = f"{cell.format(times[90])},1.5"
+    (tmp_path / "a.csv").write_text("t,x\n" + "\n".join(rows))
+    found, _ = tables.read_columns(DataFolder(tmp_path), "a.csv", "csv", {"t": "t", "x": "x"})
+    assert found["x"][[89, 90]].tolist() == [times[89], 1.5]
+    times[90] += cell == " {}.5"
+    found = tables.times_ns(found["t"], "ns")
+    np.testing.assert_array_equal(np.delete(found, 90), np.delete(times, 90))
+    assert abs(found[90] - times[90]) <= 1  # halves may be rounded either way
+
+
 @pytest.mark.parametrize("fault", ["column", "label"])
 def test_one_trial_with_a_fault_leaves_the_others(tmp_path: Path, fault: str) -> None:
     slides(tmp_path / "set")
@@ -456,7 +477,10 @@ def test_one_trial_with_a_fault_leaves_the_others(tmp_path: Path, fault: str) ->
     (failed,) = result["failed"]
     assert failed["trial"] == bad
     assert reason in failed["reason"]
-    assert len(result["imported"]) == 3
+    assert len(result["imported"]) == sum(result["split"].values()) == 3
+    done = here(*line, "--store", tmp_path / "store", "--json")
+    again = json.loads(done.stdout)
+    assert (again["there"], again["split"]) == (result["imported"], result["split"])
 
 
 @pytest.mark.parametrize("change", [-2, 1])
