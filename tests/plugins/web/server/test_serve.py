@@ -449,6 +449,27 @@ def test_what_is_no_longer_in_the_file_of_schedules_runs_no_more(
     assert waiting("label") == []
 
 
+def test_late_runs_without_a_window_do_not_begin_when_the_service_is_back(
+    service: Service, server: EmbeddedServer
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect, label
+
+    page, here = Page(server.url, server.password, "back"), replace(service, name="back")
+    asyncio.run(serve._register(here, [], (collect, label)))
+    early = page.run("collect", protocol="p.yaml")["id"]
+    window = page.run("collect", protocol="p.yaml", until="06:00")["id"]
+    analysis = page.run("label")["id"]
+    later = {"type": "SCHEDULED", "state_details": {"scheduled_time": "2100-01-01T00:00:00Z"}}
+    asked = {"parameters": {"wanted": {"protocol": "p.yaml"}}, "state": later}
+    there = page.deployment("collect")["id"]
+    future = page.call(f"/deployments/{there}/create_flow_run", asked)["id"]
+    asyncio.run(serve._register(here, [], (collect, label)))
+    assert page.state(early)["message"] == "missed while the service was down"
+    assert page.state(early)["type"] == "CANCELLED"
+    for run in (window, analysis, future):
+        assert page.state(run)["type"] == "SCHEDULED"
+
+
 def test_a_moved_store_is_not_taken_for_another(
     service: Service, server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
