@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
@@ -16,6 +17,7 @@ import yaml
 
 from sliplab.flows.running import run_records
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
+from sliplab.plugins.alerts import outbox
 from sliplab.plugins.alerts.conditions import Event, events
 from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
@@ -204,6 +206,31 @@ def test_a_target_that_never_answers_delays_no_other(tmp_path: Path) -> None:
     for second in range(3, 60):
         box.send("t", NOW + timedelta(seconds=second))
     assert hanging.taken == ["event 0", "event 1\nevent 2"]
+
+
+def test_a_full_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, receiver = TrialStore.create(tmp_path / "s"), Receiver()
+    said: list[str] = []
+
+    def full(path: Path, data: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    begun = Outbox(store, [receiver], 30, NOW, said.append)
+    with monkeypatch.context() as disk:
+        disk.setattr(outbox, "write_json", full)
+        for box in (begun, Outbox(TrialStore.create(tmp_path / "new"), [receiver], 30, NOW, print)):
+            box.add(Event("a", "disk", "no room", NOW), urgent=True)
+            for second in range(0, 60, 3):
+                box.send("t", NOW + timedelta(seconds=second))
+            assert receiver.taken.count("no room") == 1
+            receiver.taken.clear()
+    assert len(said) == 1
+    assert "No space left" in said[0]
+    begun.send("t", NOW + timedelta(seconds=60))
+    again = Outbox(store, [receiver], 30, NOW, said.append)
+    assert not again.add(Event("a", "disk", "no room", NOW), urgent=True)
+    again.send("t", NOW + timedelta(seconds=61))
+    assert receiver.taken == []
 
 
 def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Path) -> None:
