@@ -28,6 +28,7 @@ from sliplab.storage.trials.store import TrialStore
 FOLDER, BEGAN = "alerts", "began.json"
 EVER = datetime.min.replace(tzinfo=UTC)
 FIRST_RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
+HOUR = timedelta(hours=1)
 WAIT_S = 1.0
 """Longest wait for the targets' answers, s; later ones are found at the next look."""
 
@@ -87,6 +88,7 @@ class Outbox:
             self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
         else:
             self._write(self._folder / BEGAN, {"began": _utc(now)})
+        self.correct_begin(now)
         # addresses that differ in their secrets alone have one name
         names = [target.name for target in targets]
         same = [names[:k].count(name) for k, name in enumerate(names)]
@@ -97,6 +99,13 @@ class Outbox:
         files = {path: read_json(path) for path in self._files()}
         self._known = set(files)
         self._waiting = {path: data for path, data in files.items() if self._waits(data)}
+
+    def correct_begin(self, now: datetime) -> None:
+        """Begin now where alerts would begin in the future: the clock was wrong, and is right."""
+        if self.began > now:
+            self._say(f"the clock was set back: alerts began {_utc(now)}, not {_utc(self.began)}")
+            self.began = now
+            self._write(self._folder / BEGAN, {"began": _utc(now)})
 
     def add(self, event: Event, urgent: bool) -> bool:
         """Keep an event to be sent; False if it is known, or older than the alerts."""
@@ -126,8 +135,10 @@ class Outbox:
             self._write(path, data)
         taken = self._collect(now)
         for line in self._lines:
-            line.sent = [moment for moment in line.sent if now - moment < timedelta(hours=1)]
-            if line.message is not None or line.next_try > now or len(line.sent) >= self._most:
+            # neither a try nor a message in the future, where the clock was once, delays others
+            line.sent = [moment for moment in line.sent if timedelta() <= now - moment < HOUR]
+            waits = timedelta() < line.next_try - now <= timedelta(seconds=LONGEST_RETRY_S)
+            if line.message is not None or waits or len(line.sent) >= self._most:
                 continue
             events = {
                 path: data

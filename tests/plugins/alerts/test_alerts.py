@@ -233,6 +233,32 @@ def test_a_full_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert receiver.taken == []
 
 
+@pytest.mark.parametrize("anew", [False, True], ids=["while it runs", "at its next start"])
+def test_a_clock_that_was_wrong_once_silences_nothing(tmp_path: Path, anew: bool) -> None:
+    store, receiver, down = TrialStore.create(tmp_path / "s"), Receiver(), Receiver("b", up=False)
+    wrong = NOW + timedelta(days=1000)
+    changes = {"most_per_hour": 1, "ping": "http://here"}
+    watching, pinged = watcher(store, [receiver, down], wrong, **changes)
+
+    def pause(when: datetime) -> None:
+        made = control.ask(store, "pause")
+        path = store.folder / "control" / f"{made.number:06d}.json"
+        write_json(path, {**read_json(path), "when": (when - timedelta(hours=1)).isoformat()})
+
+    pause(wrong)
+    watching.look(wrong)
+    assert (len(receiver.taken), len(pinged), down.tried) == (1, 1, 1)
+    if anew:
+        watching, pinged = watcher(store, [receiver, down], NOW, **changes)
+    down.up = True
+    pause(NOW)
+    watching.look(NOW)
+    assert len(receiver.taken) == 2
+    assert down.tried == 2
+    assert len(pinged) == (1 if anew else 2)
+    assert datetime.fromisoformat(read_json(store.folder / "alerts/began.json")["began"]) == NOW
+
+
 def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Path) -> None:
     one, other = Receiver("tgram://****"), Receiver("tgram://****", up=False)
     box = Outbox(TrialStore.create(tmp_path / "s"), [one, other], 30, NOW, lambda text: None)
