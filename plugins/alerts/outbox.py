@@ -4,8 +4,9 @@
     STORE/alerts/KEY.json        an event, to whom it goes, and when each took it
 
 An event is written before it is sent, under a name made of its key: it is sent once, however often
-it is found. While the disk is full, events are in memory alone. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
-the others do not wait for it: each message is sent in a thread.
+it is found. While the disk is full, events are in memory alone. A target that does not answer is
+tried again after 10 s, 20 s and so on to 5 minutes; the others do not wait for it: each message is
+sent in a thread.
 """
 
 from __future__ import annotations

@@ -109,6 +109,10 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     by_hand = str(uuid4())
     run_records.begin(store.folder, by_hand, "label", run_records.EMBEDDED)
     run_records.end(store.folder, by_hand, "CRASHED", "KeyboardInterrupt: ", "flow")
+    lost = str(uuid4())
+    run_records.begin(store.folder, lost, "chain", run_records.EMBEDDED)
+    over = f"the window is over and {run_records.NOTHING_TAKEN}: in use by ben"
+    run_records.end(store.folder, lost, "COMPLETED", over, "flow")
     control.ask(store, "pause", who="anna", why="lunch")
     for attempt in (1, 2):
         fail(tiny, "b", attempt)
@@ -121,7 +125,7 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     done = state(campaigns=[replace(RUNNING, missing=0, planned=4, nights_of_disk=None)])
     texts = {item.kind: item.text for item in [*found(store, at), *found(store, done)]}
     assert set(texts) == set(KINDS)
-    assert texts["run failed"] == "collect of nightly failed: the arm did not answer"
+    fault = "collect of nightly failed: the arm did not answer"
     assert "pause by anna" in texts["paused"]
     assert "event_rate at the reference trial r2: -17.0 %" in texts["drift"]
     assert "no trial for 120 min" in texts["idle"]
@@ -129,7 +133,8 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     assert "b failed 2 times" in texts["trial set aside"]
     assert texts["campaign done"] == "tiny (simulated): done, 4 of 4 trials"
     failed = [item.text for item in found(store, at) if item.kind == "run failed"]
-    assert len(failed) == 1  # the one that a person stopped did not fail
+    # not the one that a person stopped
+    assert sorted(failed) == [f"chain completed: {over}", fault]
     few = found(store, at, about=["disk"])
     assert [item.kind for item in few] == ["disk"]
 

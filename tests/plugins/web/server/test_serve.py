@@ -275,6 +275,17 @@ def test_a_rig_that_is_free_again_is_taken(
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 
+def test_a_night_without_a_trial_says_so(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect
+
+    monkeypatch.setattr(deployments, "until_of", lambda *_: 1.0)
+    state = collect(Collect(protocol=protocol, until="06:00"), return_state=True)
+    assert state.type.value == "COMPLETED"
+    assert state.message.endswith("the next collection continues; no trial was taken")
+
+
 def test_a_run_that_waits_for_its_rig_is_stopped(
     service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
