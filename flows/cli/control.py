@@ -65,7 +65,7 @@ def stop(
     wanted: ControlOptions = ControlOptions(wait_s=60.0),
     as_json: JsonOption = False,
 ) -> None:
-    """Stop a running collection at once, arm first, like Ctrl-C in its terminal."""
+    """Stop a collection at once, arm first, like Ctrl-C; also one that starts or waits."""
     from sliplab.flows.collecting.requests import halt
     from sliplab.storage.trials.store import TrialStore
 

@@ -3,10 +3,11 @@
     STORE/.live/watched         touched by every page that is watched
     STORE/.live/state.json      the trial, its phase, the last lines for people
     STORE/.live/pictures.json   the last picture of each camera, JPEG in base64
+    STORE/.live/waiting.json    runs of the service that wait or have begun, of those with the arm
 
-Nothing here is data: the files are replaced some times a second, not flushed, and deleted with the
-session. The trial only leaves references to its last chunks; a thread makes pictures of them. While
-nobody watches it does nothing but look for `watched`.
+Nothing here is data: the files are replaced, not flushed, and those of a session deleted with it.
+The trial only leaves references to its last chunks; a thread makes pictures of them. While nobody
+watches it does nothing but look for `watched`.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ else:
 THREAD = "live feed"
 """Name of the thread that publishes."""
 FOLDER = ".live"
-WATCHED, STATE, PICTURES = "watched", "state.json", "pictures.json"
+WATCHED, STATE, PICTURES, WAITING = "watched", "state.json", "pictures.json", "waiting.json"
 PERIOD_S = 0.5
 """Of new pictures, s."""
 WATCHED_S = 5.0
@@ -91,6 +92,16 @@ class LiveFolder:
                 return os.fstat(file.fileno()).st_mtime_ns, file.read()
         except (OSError, UnicodeDecodeError):
             return 0, ""
+
+    def write(self, name: str, text: str) -> None:
+        """Replace a file; it is not flushed, as it is no data.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        beside = self.folder / f"{name}.new"
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, self.folder / name)
 
 
 class LiveFeed:
@@ -180,9 +191,7 @@ class LiveFeed:
     def _write(self, written: dict[str, str], name: str, text: str) -> None:
         if written.get(name) == text:
             return
-        beside = self._live.folder / f"{name}.new"
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, self._live.folder / name)  # not flushed: it is no data
+        self._live.write(name, text)
         written[name] = text
 
     def _pictures(self, recent: dict[str, tuple[Chunk, ...]]) -> dict[str, str]:

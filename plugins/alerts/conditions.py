@@ -85,7 +85,9 @@ def _failed_runs(store: TrialStore, now: datetime) -> Iterator[Event]:
         if ended is None:
             if run_records.was_killed(run):  # the next program that opens the store writes its end
                 yield Event(f"run {run['run']}", "run failed", f"{name}: its process is gone", now)
-        elif ended.get("state") in FAILED and not run_records.was_stopped(ended):
+        elif (ended.get("state") in FAILED and not run_records.was_stopped(ended)) or (
+            run_records.NOTHING_TAKEN in str(ended.get("message"))
+        ):
             text = f"{name} {str(ended['state']).lower()}: {ended.get('message') or 'no message'}"
             since = datetime.fromisoformat(ended["when"])
             yield Event(f"run {run['run']}", "run failed", text, since)

@@ -4,8 +4,9 @@
     STORE/alerts/KEY.json        an event, to whom it goes, and when each took it
 
 An event is written before it is sent, under a name made of its key: it is sent once, however often
-it is found. A target that does not answer is tried again after 10 s, 20 s and so on to 5 minutes;
-the others do not wait for it: each message is sent in a thread.
+it is found. While the disk is full, events are in memory alone. A target that does not answer is
+tried again after 10 s, 20 s and so on to 5 minutes; the others do not wait for it: each message is
+sent in a thread.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from pathlib import Path
 
 from sliplab.plugins.alerts.conditions import Event
 from sliplab.plugins.alerts.targets import Target
-from sliplab.storage.files import inside, make_folder, read_json, write_json, write_new_json
+from sliplab.storage.files import inside, make_folder, read_json, write_json
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import TrialStore
 
 FOLDER, BEGAN = "alerts", "began.json"
 EVER = datetime.min.replace(tzinfo=UTC)
 FIRST_RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
+HOUR = timedelta(hours=1)
 WAIT_S = 1.0
 """Longest wait for the targets' answers, s; later ones are found at the next look."""
 
@@ -80,9 +82,14 @@ class Outbox:
         say: Callable[[str], None],
     ) -> None:
         self._folder = inside(store.folder / FOLDER, store.folder)
-        make_folder(self._folder)
-        write_new_json(self._folder / BEGAN, {"began": _utc(now)})
-        self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
+        self._most, self._say, self._fault = most_per_hour, say, ""
+        self._unwritten: dict[Path, Json] = {}
+        self.began = now
+        if (self._folder / BEGAN).exists():
+            self.began = datetime.fromisoformat(read_json(self._folder / BEGAN)["began"])
+        else:
+            self._write(self._folder / BEGAN, {"began": _utc(now)})
+        self.correct_begin(now)
         # addresses that differ in their secrets alone have one name
         names = [target.name for target in targets]
         same = [names[:k].count(name) for k, name in enumerate(names)]
@@ -90,10 +97,16 @@ class Outbox:
             _Line(target, _digest(f"{target.name}#{k}" if k else target.name))
             for target, k in zip(targets, same, strict=True)
         ]
-        self._most, self._say = most_per_hour, say
         files = {path: read_json(path) for path in self._files()}
         self._known = set(files)
         self._waiting = {path: data for path, data in files.items() if self._waits(data)}
+
+    def correct_begin(self, now: datetime) -> None:
+        """Begin now where alerts would begin in the future: the clock was wrong, and is right."""
+        if self.began > now:
+            self._say(f"the clock was set back: alerts began {_utc(now)}, not {_utc(self.began)}")
+            self.began = now
+            self._write(self._folder / BEGAN, {"began": _utc(now)})
 
     def add(self, event: Event, urgent: bool) -> bool:
         """Keep an event to be sent; False if it is known, or older than the alerts."""
@@ -109,9 +122,8 @@ class Outbox:
             "sent": {line.key: None for line in self._lines},
         }
         self._known.add(path)
-        if not write_new_json(path, data):
-            return False
         self._waiting[path] = data
+        self._write(path, data)
         return True
 
     def send(self, title: str, now: datetime, *, quiet: bool = False) -> int:
@@ -120,10 +132,14 @@ class Outbox:
         Args:
             quiet: only urgent ones.
         """
+        for path, data in list(self._unwritten.items()):
+            self._write(path, data)
         taken = self._collect(now)
         for line in self._lines:
-            line.sent = [moment for moment in line.sent if now - moment < timedelta(hours=1)]
-            if line.message is not None or line.next_try > now or len(line.sent) >= self._most:
+            # neither a try nor a message in the future, where the clock was once, delays others
+            line.sent = [moment for moment in line.sent if timedelta() <= now - moment < HOUR]
+            waits = timedelta() < line.next_try - now <= timedelta(seconds=LONGEST_RETRY_S)
+            if line.message is not None or waits or len(line.sent) >= self._most:
                 continue
             events = {
                 path: data
@@ -162,9 +178,23 @@ class Outbox:
         for path in events:
             data = self._waiting[path]
             data["sent"][line.key] = _utc(now)
-            write_json(path, data)
+            self._write(path, data)
             if not self._waits(data):
                 del self._waiting[path]
+
+    def _write(self, path: Path, data: Json) -> None:
+        """Write a file, or keep it to be written later: a full disk is no reason to be silent."""
+        self._unwritten[path] = data
+        try:
+            make_folder(self._folder)
+            write_json(path, data)
+        except OSError as error:
+            if str(error.strerror) != self._fault:
+                self._fault = str(error.strerror)
+                self._say(f"messages are sent, but kept in memory only: {error}")
+            return
+        del self._unwritten[path]
+        self._fault = ""
 
     def _waits(self, data: Json) -> bool:
         return any(_unsent(data, line) for line in self._lines)

@@ -74,8 +74,9 @@ def record(
     """Record streams without a protocol and without an arm, trial by trial.
 
     At a terminal keys start, stop and mark; otherwise it begins at once. Ctrl-C ends and keeps the
-    trial, and so does the end of the last stream. Ends with 1 if a stream failed or nothing came.
-    After a crash, what verifies of an unfinished trial is kept by the next record or verify.
+    trial, and so does the end of the last stream. Ends with 1 if a stream failed or nothing came,
+    with 130 if Ctrl-C came before --for was over. After a crash, what verifies of an unfinished
+    trial is kept by the next record or verify.
     """
     from sliplab.plugins.record.keys import pressed_keys
     from sliplab.plugins.record.recorder import Recorder, levels

@@ -24,7 +24,7 @@ _FORMAT = 1
 
 
 class Overtaken(StoreError):
-    """Another user decided about this trial first; the message gives the user and the decision."""
+    """The last decision is not the one that was seen; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def decide(
         seen: number of the last decision that was checked, 0 for none.
 
     Raises:
-        Overtaken: there is a newer decision than `seen`; nothing was written.
+        Overtaken: the last decision is not `seen`; nothing was written.
         ValueError: a rejection without a reason, or onsets that cannot be.
         OSError: it cannot be written.
     """
@@ -123,7 +123,9 @@ def decide(
     }
     if max(journal.numbers(), default=0) == seen and journal.add(made.number, data):
         return made
-    newest = history(store, campaign, trial)[-1]
+    newest = last(store, campaign, trial)
+    if newest is None or newest.number < seen:  # moved away, as the message of a damaged one says
+        raise Overtaken(f"{trial}: the decision that was seen is there no longer")
     raise Overtaken(f"{trial}: there is a newer decision:  {newest}")
 
 
@@ -149,11 +151,12 @@ def last(store: TrialStore, campaign: str, trial: str) -> Decision | None:
 
 
 def counts(store: TrialStore, campaign: str) -> dict[str, int]:
-    """Count the decisions of each trial; trials without one are left out."""
+    """Return the number of each trial's last decision; trials without one are left out."""
     folder = store.folder / FOLDER / safe_name(campaign)
     if not folder.is_dir():
         return {}
-    found = {path.name: len(Journal(path).numbers()) for path in folder.iterdir()}
+    # not how many there are: damaged ones may have been moved away
+    found = {path.name: max(Journal(path).numbers(), default=0) for path in folder.iterdir()}
     return {name: count for name, count in found.items() if count}
 
 

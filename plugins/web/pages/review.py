@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, StrictInt, ValidationError
+from pydantic import BaseModel, Field, StrictInt, ValidationError
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
@@ -113,7 +113,7 @@ class _Asked(BaseModel):
     verdict: Verdict
     lines: _Lines
     label: str
-    seen: StrictInt
+    seen: Annotated[StrictInt, Field(ge=0)]
     who: str
     why: str
 

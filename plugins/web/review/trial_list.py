@@ -38,7 +38,7 @@ class ReviewRow:
         key: of the label that the present settings give.
         reasons: for doubt, as texts, gravest first.
         severity: of the gravest reason, 0 for none.
-        state: of the decision; who: its reviewer; decisions: number of all decisions.
+        state: of the decision; who: its reviewer; decisions: number of the last decision.
         problem: why the decisions cannot be read; empty if they can.
         rank: its place among those that a review would change most; 0 for all without that order.
     """

@@ -107,7 +107,10 @@ def until_of(wanted: OnRig, run: Any) -> float | None:
     due: datetime = run.expected_start_time or run.start_time
     end = window_end(due, wanted.until, wanted.timezone)
     if datetime.now(end.tzinfo) >= end:
-        raise WindowOver(f"the window ended {end:%Y-%m-%d %H:%M %Z}, before the run began")
+        raise WindowOver(
+            f"the window ended {end:%Y-%m-%d %H:%M %Z}, before the run began; "
+            f"{run_records.NOTHING_TAKEN}"
+        )
     return end.timestamp()
 
 
@@ -133,7 +136,9 @@ def when_free(
             if run_request.until is None and waited >= patience_s:
                 raise
             if run_request.until is not None and datetime.now().timestamp() >= run_request.until:
-                raise WindowOver(f"the window is over and no trial was taken: {busy}") from None
+                raise WindowOver(
+                    f"the window is over and {run_records.NOTHING_TAKEN}: {busy}"
+                ) from None
             if not waited:
                 _report_waiting(run, str(busy))
         stopping.wait(POLL_S)
@@ -252,7 +257,14 @@ def _run_request(
 def _take(wanted: OnRig, run_request: RunRequest, run: Any) -> str:
     from sliplab.flows.collect import collect as take
 
-    done = when_free(run_request, wanted.patience_min * 60, partial(take, run_request), run)
+    campaign = TrialStore(run_request.store).campaign(run_request.campaign)
+    before = campaign.committed()
+    try:
+        done = when_free(run_request, wanted.patience_min * 60, partial(take, run_request), run)
+    except WindowOver as over:
+        if run_records.NOTHING_TAKEN in str(over) or campaign.committed() != before:
+            raise
+        raise WindowOver(f"{over}; {run_records.NOTHING_TAKEN}") from None
     simulated = "simulated " if run_request.rig.simulated else ""
     return (
         f"{done['taken']} {simulated}trials taken, {done['committed']} of {done['planned']} "

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,12 +23,14 @@ from time import monotonic
 from typing import Any
 from uuid import UUID
 
+from sliplab.flows.collecting.live_feed import WAITING, LiveFolder
 from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
 from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
 from sliplab.plugins.web.server.service import service
-from sliplab.plugins.web.server.waiting_runs import is_by_schedule
-from sliplab.storage.trials import control
+from sliplab.plugins.web.server.waiting_runs import cancel, is_by_schedule, moves_arm
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.control import last_number, stop_after
 from sliplab.storage.trials.store import TrialStore
 
 MOST_AT_ONCE = 16
@@ -58,7 +61,10 @@ class ServedRuns:
         self._schedules = schedules
         self._run: Any = None
         self._asked: Any = None
-        self._since = 0
+        self._since = self._looked = last_number(TrialStore(store))
+        self._moving = {run for run, flow in on_rig.items() if moves_arm(flow)}
+        self._live = LiveFolder(store)
+        self._shown: list[Json] | None = None
         self._process: asyncio.subprocess.Process | None = None
         self._stop_by: float | None = None
         self._words: dict[UUID, asyncio.Future[None]] = {}
@@ -82,7 +88,12 @@ class ServedRuns:
                         with suppress(Exception, asyncio.CancelledError):
                             await looking
                         await asyncio.wait({ending}, timeout=poll_s)
-                await self._stop()
+                    await self._stop()  # the arm first
+                    with suppress(Exception):  # of a lost server; the next start looks again
+                        for run in await self._due(client):
+                            if run.deployment_id in self._moving:
+                                await cancel(client, run, "the service ended before it began")
+                self._show([])
             finally:
                 stopping.request()  # requests that wait for a trial's end do not delay the end
 
@@ -96,27 +107,64 @@ class ServedRuns:
             if run.state.is_pending():
                 await self._start(run)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
-        due = await client.get_scheduled_flow_runs_for_deployments(
-            [*self._on_rig, *self._control], scheduled_before=datetime.now(UTC)
-        )
+        due = await self._without_stopped(client, await self._due(client))
+        waiting = []
         for run in due:
             if run.deployment_id in self._control and run.id not in self._words:
                 flow, context = self._control[run.deployment_id], contextvars.copy_context()
                 self._words[run.id] = asyncio.get_running_loop().run_in_executor(
                     threads, context.run, _carry_out_here, flow, run
                 )
-            elif run.deployment_id in self._on_rig and self._process is None:
+            elif run.deployment_id in self._on_rig and self._process is not None:
+                waiting.append(run)
+            elif run.deployment_id in self._on_rig:
                 by_schedule = is_by_schedule(run)
                 begins = await begin_of_run(run, self._schedules) if by_schedule else None
                 if begins is None or begins <= datetime.now(UTC):
                     await self._begin(client, run)
+        self._show(waiting if self._process is None else [self._run, *waiting])
+
+    async def _due(self, client: Any) -> list[Any]:
+        found: list[Any] = await client.get_scheduled_flow_runs_for_deployments(
+            [*self._on_rig, *self._control], scheduled_before=datetime.now(UTC)
+        )
+        return found
+
+    async def _without_stopped(self, client: Any, due: list[Any]) -> list[Any]:
+        """Cancel what would move the arm after a person's stop; return the other runs."""
+        store = TrialStore(self._store)
+        number = last_number(store)
+        if (stop := stop_after(store, self._looked)) is not None:
+            for run in due:
+                if run.deployment_id in self._moving:
+                    await cancel(client, run, f"with the {stop}")
+            due = [run for run in due if run.deployment_id not in self._moving]
+        self._looked = max(number, stop.number if stop else 0)
+        return due
+
+    def _show(self, runs: list[Any]) -> None:
+        """Tell the live page which runs have begun or wait."""
+        shown: list[Json] = [
+            {
+                "flow": self._on_rig[run.deployment_id].name,
+                "due": run.expected_start_time.isoformat(),
+                "begun": run is self._run,
+            }
+            for run in runs
+            if run.deployment_id in self._moving
+        ]
+        if self._moving and shown != self._shown:
+            with suppress(OSError):  # a full disk; the next look tries again
+                self._live.folder.mkdir(exist_ok=True)
+                self._live.write(WAITING, json.dumps(shown))
+                self._shown = shown
 
     async def _begin(self, client: Any, run: Any) -> None:
         from prefect.client.schemas.responses import SetStateStatus
         from prefect.states import Pending
 
-        # a stop from here on ends it: its process takes seconds to start, and no signal reaches it
-        self._since = control.last_number(TrialStore(self._store))
+        # a later stop ends it: its process takes seconds to start, and no signal reaches it
+        self._since = self._looked
         self._asked = run  # whose answer may be lost: it would stay pending for ever
         answer = await client.set_flow_run_state(run.id, Pending())
         self._asked = None

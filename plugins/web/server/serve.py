@@ -22,7 +22,7 @@ from sliplab.plugins.web.server.page_server import ANSWER_S, PageServer, page_se
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.plugins.web.server.service import Service, deployment_name
-from sliplab.plugins.web.server.waiting_runs import drop_unplanned
+from sliplab.plugins.web.server.waiting_runs import cancel_missed, drop_unplanned
 from sliplab.protocols import InputError
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -181,6 +181,7 @@ async def _register(
             registered[await made.aapply()] = flow
         async with get_client() as client:
             await drop_unplanned(client, registered, schedules)
+            await cancel_missed(client, registered)
         await _close_stranded(here.name, names, here.folder)
         await _delete_older(here.name, names, here.folder)
     return registered

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
+from sliplab.flows.collecting.requests import MOVING
 from sliplab.flows.running import console
 from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
 
@@ -70,6 +71,28 @@ async def drop_unplanned(
 def is_by_schedule(run: Any) -> bool:
     """Return whether a schedule planned a run; one that a person resumed has begun before."""
     return run.run_count == 0 and (run.auto_scheduled or AGAIN in run.tags)
+
+
+def moves_arm(flow: Any) -> bool:
+    """Return whether the runs of a flow move the arm."""
+    return getattr(flow, "name", "") in MOVING
+
+
+async def cancel_missed(client: Any, deployments: Mapping[UUID, Any]) -> None:
+    """Cancel late runs that move the arm and have no window: they would begin at any hour."""
+    moving = [deployment for deployment, flow in deployments.items() if moves_arm(flow)]
+    for run in await scheduled_runs(client, moving):
+        late = run.expected_start_time <= datetime.now(UTC)
+        if late and "until" not in run.parameters.get("wanted", {}):
+            await cancel(client, run, "missed while the service was down")
+
+
+async def cancel(client: Any, run: Any, why: str) -> None:
+    """Cancel a run that has not begun."""
+    from prefect.states import Cancelled
+
+    await client.set_flow_run_state(run.id, Cancelled(message=why))
+    console.say(f"cancelled: {run.name}, due {run.expected_start_time:%Y-%m-%d %H:%M %Z}: {why}")
 
 
 async def scheduled_runs(client: Any, deployments: Sequence[UUID]) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
@@ -16,6 +17,7 @@ import yaml
 
 from sliplab.flows.running import run_records
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
+from sliplab.plugins.alerts import outbox
 from sliplab.plugins.alerts.conditions import Event, events
 from sliplab.plugins.alerts.outbox import Outbox
 from sliplab.plugins.alerts.settings import KINDS, AlertSettings, load_alerts
@@ -107,6 +109,10 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     by_hand = str(uuid4())
     run_records.begin(store.folder, by_hand, "label", run_records.EMBEDDED)
     run_records.end(store.folder, by_hand, "CRASHED", "KeyboardInterrupt: ", "flow")
+    lost = str(uuid4())
+    run_records.begin(store.folder, lost, "chain", run_records.EMBEDDED)
+    over = f"the window is over and {run_records.NOTHING_TAKEN}: in use by ben"
+    run_records.end(store.folder, lost, "COMPLETED", over, "flow")
     control.ask(store, "pause", who="anna", why="lunch")
     for attempt in (1, 2):
         fail(tiny, "b", attempt)
@@ -119,7 +125,7 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     done = state(campaigns=[replace(RUNNING, missing=0, planned=4, nights_of_disk=None)])
     texts = {item.kind: item.text for item in [*found(store, at), *found(store, done)]}
     assert set(texts) == set(KINDS)
-    assert texts["run failed"] == "collect of nightly failed: the arm did not answer"
+    fault = "collect of nightly failed: the arm did not answer"
     assert "pause by anna" in texts["paused"]
     assert "event_rate at the reference trial r2: -17.0 %" in texts["drift"]
     assert "no trial for 120 min" in texts["idle"]
@@ -127,7 +133,8 @@ def test_each_kind_is_found_and_named(tmp_path: Path) -> None:
     assert "b failed 2 times" in texts["trial set aside"]
     assert texts["campaign done"] == "tiny (simulated): done, 4 of 4 trials"
     failed = [item.text for item in found(store, at) if item.kind == "run failed"]
-    assert len(failed) == 1  # the one that a person stopped did not fail
+    # not the one that a person stopped
+    assert sorted(failed) == [f"chain completed: {over}", fault]
     few = found(store, at, about=["disk"])
     assert [item.kind for item in few] == ["disk"]
 
@@ -204,6 +211,57 @@ def test_a_target_that_never_answers_delays_no_other(tmp_path: Path) -> None:
     for second in range(3, 60):
         box.send("t", NOW + timedelta(seconds=second))
     assert hanging.taken == ["event 0", "event 1\nevent 2"]
+
+
+def test_a_full_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, receiver = TrialStore.create(tmp_path / "s"), Receiver()
+    said: list[str] = []
+
+    def full(path: Path, data: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    begun = Outbox(store, [receiver], 30, NOW, said.append)
+    with monkeypatch.context() as disk:
+        disk.setattr(outbox, "write_json", full)
+        for box in (begun, Outbox(TrialStore.create(tmp_path / "new"), [receiver], 30, NOW, print)):
+            box.add(Event("a", "disk", "no room", NOW), urgent=True)
+            for second in range(0, 60, 3):
+                box.send("t", NOW + timedelta(seconds=second))
+            assert receiver.taken.count("no room") == 1
+            receiver.taken.clear()
+    assert len(said) == 1
+    assert "No space left" in said[0]
+    begun.send("t", NOW + timedelta(seconds=60))
+    again = Outbox(store, [receiver], 30, NOW, said.append)
+    assert not again.add(Event("a", "disk", "no room", NOW), urgent=True)
+    again.send("t", NOW + timedelta(seconds=61))
+    assert receiver.taken == []
+
+
+@pytest.mark.parametrize("anew", [False, True], ids=["while it runs", "at its next start"])
+def test_a_clock_that_was_wrong_once_silences_nothing(tmp_path: Path, anew: bool) -> None:
+    store, receiver, down = TrialStore.create(tmp_path / "s"), Receiver(), Receiver("b", up=False)
+    wrong = NOW + timedelta(days=1000)
+    changes = {"most_per_hour": 1, "ping": "http://here"}
+    watching, pinged = watcher(store, [receiver, down], wrong, **changes)
+
+    def pause(when: datetime) -> None:
+        made = control.ask(store, "pause")
+        path = store.folder / "control" / f"{made.number:06d}.json"
+        write_json(path, {**read_json(path), "when": (when - timedelta(hours=1)).isoformat()})
+
+    pause(wrong)
+    watching.look(wrong)
+    assert (len(receiver.taken), len(pinged), down.tried) == (1, 1, 1)
+    if anew:
+        watching, pinged = watcher(store, [receiver, down], NOW, **changes)
+    down.up = True
+    pause(NOW)
+    watching.look(NOW)
+    assert len(receiver.taken) == 2
+    assert down.tried == 2
+    assert len(pinged) == (1 if anew else 2)
+    assert datetime.fromisoformat(read_json(store.folder / "alerts/began.json")["began"]) == NOW
 
 
 def test_addresses_that_differ_in_their_secrets_both_get_a_message(tmp_path: Path) -> None:

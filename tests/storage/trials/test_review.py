@@ -57,6 +57,24 @@ def test_who_looked_at_an_older_decision_is_told(store: TrialStore) -> None:
     assert len(review.history(store, "c", "t")) == 1
 
 
+def test_decisions_that_were_moved_away_are_missed_not_stumbled_over(store: TrialStore) -> None:
+    """What the message of a damaged decision advises."""
+    folder = store.folder / "review" / "c" / "t"
+    for seen in range(2):
+        decide(store, seen)
+    (folder / "000001.json").unlink()
+    assert review.counts(store, "c") == {"t": 2}
+    assert decide(store, 2).number == 3
+    for path in folder.iterdir():
+        path.unlink()
+    for seen in (3, 99, -1):
+        with pytest.raises(review.Overtaken, match="is there no longer"):
+            decide(store, seen)
+    assert decide(store, 0).number == 1
+    with pytest.raises(review.Overtaken, match="is there no longer"):
+        decide(store, 99)
+
+
 def test_of_many_who_decide_at_once_each_is_kept_or_told(store: TrialStore) -> None:
     def insist(name: str) -> int:
         for reported in range(100):

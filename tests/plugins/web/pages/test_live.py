@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from sliplab.flows.collecting.live_feed import STATE, LiveFolder
+from sliplab.flows.collecting.live_feed import STATE, WAITING, LiveFolder
 from sliplab.flows.log import log_entries
 from sliplab.plugins.web.pages import live
 from sliplab.plugins.web.pages.live import Hub, event
 from sliplab.plugins.web.pages.web import Web
+from sliplab.plugins.web.server.service import Service
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -85,6 +86,20 @@ def test_page_says_what_is_wrong_with_the_store(
             await stream.aclose()
 
     assert "the disk is away" in asyncio.run(watch())
+
+
+def test_runs_that_wait_for_their_turn_are_shown(store: TrialStore) -> None:
+    due = "2026-11-21T22:00:00+00:00"
+    runs = [{"flow": flow, "due": due, "begun": flow == "study"} for flow in ("study", "collect")]
+    live_folder = LiveFolder(store.folder)
+    live_folder.watch()
+    live_folder.write(WAITING, json.dumps(runs))
+    service = Service(str(store.folder), "mock", "lab", "embedded", 1, ())
+    shown = Hub(Web(store, ACCESS, service=service))._tick(0.0)["status"]
+    assert f'Waits for its turn</strong>: collect, due <time datetime="{due}">' in shown
+    assert "Starts, or waits for the rig</strong>: study" in shown
+    # of a service that is gone
+    assert "collect" not in Hub(Web(store, ACCESS))._tick(0.0)["status"]
 
 
 def test_event_keeps_lines() -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +18,14 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sliplab.flows.collecting import requests
+from sliplab.flows.collecting.live_feed import WAITING, LiveFolder
+from sliplab.flows.running import stopping
 from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.storage.files import read_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
+from sliplab.storage.trials import control
 from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -143,6 +148,103 @@ def test_a_run_in_an_hour_that_the_clocks_leave_out_waits_for_its_end(
         assert begun == expected
 
 
+class Queue:
+    """Prefect's server, with runs that are due."""
+
+    def __init__(self, *flows: str) -> None:
+        self.flows = {uuid4(): SimpleNamespace(name=name) for name in flows}
+        self.runs = [self.due(deployment) for deployment in self.flows]
+        self.said: dict[UUID, str] = {}
+
+    def due(self, deployment: UUID) -> Any:
+        return SimpleNamespace(
+            id=uuid4(),
+            name="run",
+            deployment_id=deployment,
+            run_count=0,
+            auto_scheduled=False,
+            tags=[],
+            parameters={},
+            expected_start_time=datetime.now(UTC),
+        )
+
+    async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
+        return [run for run in self.runs if run.id not in self.said]
+
+    async def set_flow_run_state(self, run: UUID, state: Any) -> Any:
+        self.said[run] = f"{state.type.value}: {state.message}"
+        return SimpleNamespace(status=None)
+
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[Queue]:
+        yield self
+
+
+def waiting(store: TrialStore) -> Any:
+    """What the live page is told."""
+    return json.loads(LiveFolder(store.folder).read(WAITING)[1])
+
+
+def test_a_stop_cancels_what_waits_and_would_move_the_arm(tmp_path: Path) -> None:
+    store = TrialStore.create(tmp_path / "s")
+    control.ask(store, "stop", who="anna")  # before the service began: means none of its runs
+    client, threads = Queue("collect", "study", "label"), None
+    served = ServedRuns(store.folder, client.flows, {})
+    served._process, served._run = SimpleNamespace(returncode=None), client.runs[0]
+
+    async def supervise(client: Any) -> None:
+        pass
+
+    served._supervise = supervise
+    client.runs = client.runs[1:]
+    asyncio.run(served._look(client, threads))
+    assert client.said == {}
+    assert [(run["flow"], run["begun"]) for run in waiting(store)] == [
+        ("collect", True),
+        ("study", False),
+    ]
+    control.ask(store, "pause")
+    control.ask(store, "stop", who="ben", why="smoke")
+    control.ask(store, "resume")
+    asyncio.run(served._look(client, threads))
+    (said,) = client.said.values()
+    assert said.startswith("CANCELLED: with the stop by ben, ")
+    assert next(iter(client.said)) == client.runs[0].id
+    assert [run["flow"] for run in waiting(store)] == ["collect"]
+    client.runs.append(client.due(client.runs[0].deployment_id))  # started after the stop
+    asyncio.run(served._look(client, threads))
+    assert len(client.said) == 1
+
+
+def test_a_stop_during_a_begin_is_left_to_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It came after the look at the requests: the run's own process finds it."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
+    served, threads = ServedRuns(store.folder, client.flows, {}), None
+    last = runs.last_number
+    monkeypatch.setattr(runs, "last_number", lambda of: (last(of), control.ask(store, "stop"))[0])
+    monkeypatch.setattr(runs, "stop_after", lambda of, number: None)
+    asyncio.run(served._look(client, threads))
+    assert control.stop_after(store, served._since) is not None
+
+
+def test_what_waits_ends_with_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect", "label")
+    monkeypatch.setattr("prefect.client.orchestration.get_client", client.opened)
+    monkeypatch.setattr(stopping, "request", lambda: None)
+    served = ServedRuns(store.folder, client.flows, {})
+
+    async def end() -> None:
+        over = asyncio.Event()
+        over.set()
+        await served.carry_out(0.01, over)
+
+    asyncio.run(end())
+    assert client.said == {client.runs[0].id: "CANCELLED: the service ended before it began"}
+    assert waiting(store) == []
+
+
 def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
     folder = page.log.parent
     data = tiny()
@@ -178,8 +280,8 @@ def test_a_killed_run_is_closed_and_a_suspended_one_goes_on(page: Page) -> None:
     page.call(f"/flow_runs/{suspended}/resume", {})
     assert page.ended(suspended)["type"] == "COMPLETED", page.log.read_text()
     assert len(list(trials.iterdir())) == 6
-    ends = [read_json(path) for path in records.glob("*.end.json")]
-    assert sorted((end["state"], end["by"]) for end in ends) == [
+    ends = [read_json(records / f"{run}.end.json") for run in (suspended, killed)]
+    assert [(end["state"], end["by"]) for end in ends] == [
         ("COMPLETED", "flow"),
         ("CRASHED", "service"),
     ]

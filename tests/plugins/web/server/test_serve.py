@@ -275,6 +275,17 @@ def test_a_rig_that_is_free_again_is_taken(
         deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 
+def test_a_night_without_a_trial_says_so(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect
+
+    monkeypatch.setattr(deployments, "until_of", lambda *_: 1.0)
+    state = collect(Collect(protocol=protocol, until="06:00"), return_state=True)
+    assert state.type.value == "COMPLETED"
+    assert state.message.endswith("the next collection continues; no trial was taken")
+
+
 def test_a_run_that_waits_for_its_rig_is_stopped(
     service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -447,6 +458,27 @@ def test_what_is_no_longer_in_the_file_of_schedules_runs_no_more(
     start()
     assert scheduled("label") == []
     assert waiting("label") == []
+
+
+def test_late_runs_without_a_window_do_not_begin_when_the_service_is_back(
+    service: Service, server: EmbeddedServer
+) -> None:
+    from sliplab.plugins.web.server.deployments import collect, label
+
+    page, here = Page(server.url, server.password, "back"), replace(service, name="back")
+    asyncio.run(serve._register(here, [], (collect, label)))
+    early = page.run("collect", protocol="p.yaml")["id"]
+    window = page.run("collect", protocol="p.yaml", until="06:00")["id"]
+    analysis = page.run("label")["id"]
+    later = {"type": "SCHEDULED", "state_details": {"scheduled_time": "2100-01-01T00:00:00Z"}}
+    asked = {"parameters": {"wanted": {"protocol": "p.yaml"}}, "state": later}
+    there = page.deployment("collect")["id"]
+    future = page.call(f"/deployments/{there}/create_flow_run", asked)["id"]
+    asyncio.run(serve._register(here, [], (collect, label)))
+    assert page.state(early)["message"] == "missed while the service was down"
+    assert page.state(early)["type"] == "CANCELLED"
+    for run in (window, analysis, future):
+        assert page.state(run)["type"] == "SCHEDULED"
 
 
 def test_a_moved_store_is_not_taken_for_another(
