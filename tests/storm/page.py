@@ -21,6 +21,7 @@ from prefect.states import Cancelled, Cancelling, Completed, Running, Scheduled
 from sliplab.flows.running import run_records
 from sliplab.plugins.web.server import runs, schedules
 from sliplab.plugins.web.server.runs import ServedRuns
+from sliplab.plugins.web.server.service import Service
 from tests.patching import put
 from tests.storm.virtual import Notes
 
@@ -82,6 +83,8 @@ class Page:
         """Let a run come due."""
         made = UUID(int=self._rng.getrandbits(128), version=4)
         made_run = SimpleNamespace(id=made, deployment_id=deployment, name=f"run {len(self.runs)}")
+        made_run.run_count, made_run.auto_scheduled, made_run.tags = 0, False, []
+        made_run.expected_start_time = datetime.fromtimestamp(self.now_s, UTC)
         made_run.state = Scheduled()
         self.runs[made] = made_run
 
@@ -281,6 +284,7 @@ def serve(store: Path, notes: Notes, seed: int, lost: float) -> None:
     runs.asyncio = SimpleNamespace(  # type: ignore[attr-defined]
         **{**vars(asyncio), "create_subprocess_exec": page.start}
     )
+    put(runs, "service", lambda: Service(str(store), "rig.yaml", "storm", "here", 1, ()))
     rig, words = (UUID(int=rng.getrandbits(128), version=4) for _ in range(2))
     flow = SimpleNamespace(name="collect")
     served = ServedRuns(store, {rig: flow}, {words: flow})

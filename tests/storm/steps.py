@@ -109,7 +109,8 @@ class Stage:
     ) -> RunRequest:
         """Return the request to collect on a rig with these faults."""
         if not faults and "calm" in vars(self):
-            return replace(self.calm, most=most, until=until)
+            since = control.last_number(TrialStore(self.store))
+            return replace(self.calm, most=most, until=until, since=since)
         return make_request(*self.write(faults), self.store, most=most, until=until)
 
     def write(self, faults: list[dict[str, Any]]) -> list[Path]:
