@@ -309,8 +309,8 @@ class Witness:
         until = supervisor._run_request.until
         last = max((each.number for each in control.requests(store)), default=0)
 
-        def asked(trial: PlannedTrial) -> bool:
-            may = may_take(trial)
+        def asked(trial: PlannedTrial, preparation_s: float = 0.0) -> bool:
+            may = may_take(trial, preparation_s)
             if not may:
                 return may
             self._notes.add(begins=trial.id, place=places.index(trial.id))
