@@ -45,7 +45,8 @@ _SWEPT: set[Path] = set()
 """Folders that this process has swept before its first write there."""
 _NAME_BYTES = 200
 """Bytes of a target's name in that of its temporary file; a file's name has at most 255."""
-_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
+_MOST_NAME = 251
+_SAFE = re.compile(rf"[A-Za-z0-9][A-Za-z0-9=,._+-]{{0,{_MOST_NAME - 1}}}")
 
 
 def sync_folder(folder: Path) -> None:
@@ -438,9 +439,11 @@ def safe_name(name: str) -> str:
         StoreError: it could lead out of its folder.
     """
     if not _SAFE.fullmatch(name) or ".." in name:
+        shown = name if len(name) <= _MOST_NAME else f"{name[:40]}... ({len(name)} characters)"
         raise StoreError(
-            f"'{name}' cannot be the name of a folder in a store: letters, digits and . _ - = , + "
-            "are possible"
+            f"'{shown}' cannot be the name of a folder in a store: possible are up to "
+            f"{_MOST_NAME} letters, digits and . _ - = , + without two points in a row, of which "
+            "a letter or digit is the first"
         )
     return name
 

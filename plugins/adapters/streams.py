@@ -134,6 +134,7 @@ def _whole(counts: Any, part: EventFiles) -> tuple[I64, int]:
         FormatError: there are as many of those as of counts above 0.
     """
     if counts.dtype.kind == "f":
+        counts = counts.astype(np.float64, copy=False)  # 16 bits do not reach the limit
         with np.errstate(invalid="ignore"):
             good = (counts >= 0) & (counts == np.floor(counts)) & (counts <= MOST_EVENTS)
     else:

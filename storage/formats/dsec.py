@@ -420,7 +420,10 @@ def _stated_end(path: Path) -> int:
 def _integers(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind not in "iu":
-        raise FormatError("contains times that are not integers")
+        raise FormatError(
+            f"contains times of {found.dtype}, which DSEC's layout has as integers, us; rounded, "
+            "in a copy of the file, they can be imported"
+        )
     return np.where(found < LATEST_US, found, LATEST_US).astype(np.int64)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import ACTING
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
@@ -345,13 +346,17 @@ class Recording:
             stream: name of a further event camera's stream, instead of the first one's.
 
         Raises:
+            InputError: a time does not fit 64 bits.
             StoreError: the trial has no such stream.
         """
         self._check_stream(stream, EVENTS_KIND)
         clock = self.clock(stream)
-        bounds = [
-            None if t is None else -(-int(clock.to_device(t)) // 1000) for t in (start_ns, end_ns)
-        ]
+        bounds: list[int | None] = []
+        for name, t in (("start_ns", start_ns), ("end_ns", end_ns)):
+            try:
+                bounds.append(None if t is None else -(-int(clock.to_device(t)) // 1000))
+            except OverflowError:
+                raise InputError(name, "", t, "must fit 64 bits; None has no bound") from None
         with self.open(stream) as reader:
             return reader.events(*bounds)
 

@@ -203,6 +203,8 @@ def test_wrong_arguments_are_named_with_what_is_right(store: sliplab.Store, tmp_
         lambda: store.trials("depth_mm"): "where = depth_mm: cannot be read",
         lambda: store.report(against="none"): "--against = none: must be a store with a report",
         lambda: loose(trial).events(0.5): "start_ns = 0.5: must be a whole number or None",
+        lambda: trial.events(-(10**30)): f"start_ns = {-(10**30)}: must fit 64 bits",
+        lambda: trial.events(0, 10**30): f"end_ns = {10**30}: must fit 64 bits",
         lambda: trial.step("slid"): "phase = slid: must be one of approach,",
     }.items():
         with pytest.raises(sliplab.InputError) as caught:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.storage.files import json_text, read_json, read_plain, write_json
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import json_text, read_json, read_plain, safe_name, write_json
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 FINITE = LEAVES.filter(lambda value: value not in (float("inf"), float("-inf")))
@@ -63,3 +64,23 @@ def test_only_a_regular_file_of_bounded_size_is_read_as_a_whole(tmp_path: Path) 
         for read in (read_plain, read_json):
             with pytest.raises(OSError, match="not a regular file"):
                 read(wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("x" * 252, "'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx... (252 characters)' cannot"),
+        (".x", "'.x' cannot be"),
+        ("a..b", "'a..b' cannot be"),
+        ("a/b", "'a/b' cannot be"),
+    ],
+)
+def test_every_rule_of_a_name_is_in_its_message(name: str, said: str) -> None:
+    assert safe_name("x" * 251) == "x" * 251
+    with pytest.raises(StoreError) as caught:
+        safe_name(name)
+    assert said in str(caught.value)
+    assert "up to 251 letters, digits and . _ - = , + without two points in a row" in str(
+        caught.value
+    )
+    assert "a letter or digit is the first" in str(caught.value)

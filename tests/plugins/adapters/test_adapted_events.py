@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.plugins.adapters.streams import read_counts
+from sliplab.protocols.adapter_parts import EventFiles
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.recording import Recording
 from tests.plugins.adapters.adapter_streams import (
@@ -280,3 +282,10 @@ def test_arrays_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
     refused(made, tmp_path, "events.npz: streams.events: is a damaged .npz file .*encrypted")
     (folder / "events.npz").write_bytes(whole)
     assert len(imported(made, tmp_path).events()) == 200
+
+
+def test_counts_of_16_bits_are_counts() -> None:
+    part = EventFiles.model_validate({"format": "counts", "axes": ["taxel", "step"], "step_ms": 1})
+    counts = np.array([[0, 3, 60_000], [1, 0, 0]])
+    found = list(read_counts(counts.astype(np.float16), part).events())  # a warning is an error
+    assert sum(map(len, found)) == int(counts.astype(np.float16).astype(np.float64).sum())

@@ -235,6 +235,12 @@ def test_what_stands_before_damage_counts_no_events_that_run_back(tmp_path: Path
     assert (len(found.events()), _dropped(found)) == (300, {BACK: 20})
 
 
+def test_times_of_dsec_that_are_floats_are_named_by_their_type(tmp_path: Path) -> None:
+    _dsec(tmp_path / "a.h5", t=TIMES.astype(np.float32))
+    done = _line(tmp_path, tmp_path / "a.h5")
+    assert "contains times of float32, which DSEC's layout has as integers" in done.stderr
+
+
 def test_a_file_of_many_wrong_events_is_not_imported(tmp_path: Path) -> None:
     _dsec(tmp_path / "a.h5", np.r_[np.full(60, -5), np.arange(COUNT - 60)])
     done = _line(tmp_path, tmp_path / "a.h5")
