@@ -28,6 +28,7 @@ import numpy as np
 
 from sliplab.flows.running import console
 from sliplab.protocols.later import Later
+from sliplab.storage.process import is_here
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
@@ -93,12 +94,22 @@ class LiveFolder:
         except (OSError, UnicodeDecodeError):
             return 0, ""
 
+    def waiting(self) -> list[Json]:
+        """Return what is in `WAITING`; nothing where the service that wrote it was killed."""
+        try:
+            found = json.loads(self.read(WAITING)[1] or "{}")
+        except ValueError:
+            return []
+        runs: list[Json] = found["runs"] if is_here(found.get("process", {})) else []
+        return runs
+
     def write(self, name: str, text: str) -> None:
         """Replace a file; it is not flushed, as it is no data.
 
         Raises:
             OSError: it cannot be written.
         """
+        self.folder.mkdir(exist_ok=True)
         beside = self.folder / f"{name}.new"
         beside.write_text(text, encoding="utf-8")
         os.replace(beside, self.folder / name)

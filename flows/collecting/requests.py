@@ -258,10 +258,23 @@ def note_stop(
 
 def _waiting_runs(store: TrialStore) -> list[str]:
     """Return the runs of this machine that may yet move the arm, where none collects."""
-    return [
-        f"{' of '.join(filter(None, [run['flow'], run.get('deployment')]))} ({run['began']})"
+    from sliplab.flows.collecting.live_feed import LiveFolder
+
+    begun = [
+        run
         for run in run_records.open_runs(store.folder)
         if run["flow"] in MOVING and process.is_here(run.get("process", {}))
+    ]
+    names = [
+        f"{' of '.join(filter(None, [run['flow'], run.get('deployment')]))}, since {run['began']}"
+        for run in begun
+    ]
+    # a process that starts has no record yet, and what waits for its turn has none at all
+    recorded = any(run.get("deployment") for run in begun)
+    return names + [
+        f"{run['flow']}, due {run['due']}"
+        for run in LiveFolder(store.folder).waiting()
+        if not (run["begun"] and recorded)
     ]
 
 

@@ -22,7 +22,7 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.collecting.live_feed import PICTURES, STATE, WAITING, LiveFolder
+from sliplab.flows.collecting.live_feed import PICTURES, STATE, LiveFolder
 from sliplab.flows.running.console import duration, size
 from sliplab.flows.status import CampaignStatus, StatusReader, StoreStatus
 from sliplab.plugins.web.pages.controls import Controls
@@ -196,7 +196,7 @@ class Hub:
                 facts=facts(campaign),
                 disk_words=disk_words(status, campaign),
                 causes=causes(campaign),
-                waiting=self._waiting(),
+                waiting=self._live.waiting(),
                 disk=shutil.disk_usage(self._web.store.folder),
             )
             found["problem"] = ""
@@ -204,14 +204,6 @@ class Hub:
             killed = status.running is None and time.time() - written > STATUS_S
             if killed or ("now" not in found and not written):  # killed: the file stayed
                 found["now"] = self._now("")
-        return found
-
-    def _waiting(self) -> list[Json]:
-        """Return the service's runs that would move the arm; a service that is gone has none."""
-        found: list[Json] = []
-        if self._web.service is not None:
-            with suppress(ValueError):
-                found = json.loads(self._live.read(WAITING)[1] or "[]")
         return found
 
     def _new(self, name: str) -> str | None:

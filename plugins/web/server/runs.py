@@ -29,12 +29,15 @@ from sliplab.flows.running.process import collect_garbage_seldom
 from sliplab.plugins.web.server.schedules import Scheduled, begin_of_run
 from sliplab.plugins.web.server.service import service
 from sliplab.plugins.web.server.waiting_runs import cancel, is_by_schedule, moves_arm
+from sliplab.storage.process import this_process
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.control import last_number, stop_after
+from sliplab.storage.trials.control import ControlRequest, last_number, stop_after
 from sliplab.storage.trials.store import TrialStore
 
 MOST_AT_ONCE = 16
 """Requests to the arm that run at the same time."""
+DISK_S = 5.0
+"""Longest wait for the store's disk, s: a run must be cancelled also where it does not answer."""
 STOP_LIMIT_S = 30.0
 """Time in which a run must stop its arm and end, s; it is killed then."""
 
@@ -93,7 +96,7 @@ class ServedRuns:
                         for run in await self._due(client):
                             if run.deployment_id in self._moving:
                                 await cancel(client, run, "the service ended before it began")
-                self._show([])
+                await self._show([])
             finally:
                 stopping.request()  # requests that wait for a trial's end do not delay the end
 
@@ -122,7 +125,7 @@ class ServedRuns:
                 begins = await begin_of_run(run, self._schedules) if by_schedule else None
                 if begins is None or begins <= datetime.now(UTC):
                     await self._begin(client, run)
-        self._show(waiting if self._process is None else [self._run, *waiting])
+        await self._show(waiting if self._process is None else [self._run, *waiting])
 
     async def _due(self, client: Any) -> list[Any]:
         found: list[Any] = await client.get_scheduled_flow_runs_for_deployments(
@@ -132,9 +135,9 @@ class ServedRuns:
 
     async def _without_stopped(self, client: Any, due: list[Any]) -> list[Any]:
         """Cancel what would move the arm after a person's stop; return the other runs."""
-        store = TrialStore(self._store)
-        number = last_number(store)
-        if (stop := stop_after(store, self._looked)) is not None:
+        async with asyncio.timeout(DISK_S):
+            number, stop = await asyncio.to_thread(self._requests)
+        if stop is not None:
             for run in due:
                 if run.deployment_id in self._moving:
                     await cancel(client, run, f"with the {stop}")
@@ -142,7 +145,12 @@ class ServedRuns:
         self._looked = max(number, stop.number if stop else 0)
         return due
 
-    def _show(self, runs: list[Any]) -> None:
+    def _requests(self) -> tuple[int, ControlRequest | None]:
+        """Return the number of the last request, and the first stop that was not looked at yet."""
+        store = TrialStore(self._store)
+        return last_number(store), stop_after(store, self._looked)
+
+    async def _show(self, runs: list[Any]) -> None:
         """Tell the live page which runs have begun or wait."""
         shown: list[Json] = [
             {
@@ -154,10 +162,12 @@ class ServedRuns:
             if run.deployment_id in self._moving
         ]
         if self._moving and shown != self._shown:
-            with suppress(OSError):  # a full disk; the next look tries again
-                self._live.folder.mkdir(exist_ok=True)
-                self._live.write(WAITING, json.dumps(shown))
-                self._shown = shown
+            told = {"process": this_process(), "runs": shown}
+            # of a full disk; the next look tries again
+            with suppress(OSError, TimeoutError):
+                async with asyncio.timeout(DISK_S):
+                    await asyncio.to_thread(self._live.write, WAITING, json.dumps(told))
+                    self._shown = shown
 
     async def _begin(self, client: Any, run: Any) -> None:
         from prefect.client.schemas.responses import SetStateStatus

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +12,10 @@ import pytest
 
 from sliplab.flows.collect import collect
 from sliplab.flows.collecting import requests, session
+from sliplab.flows.collecting.live_feed import WAITING, LiveFolder
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import run_records, stopping
+from sliplab.storage.process import this_process
 from sliplab.storage.trials import control, journal, lock
 from sliplab.storage.trials.store import Campaign, TrialStore
 from tests.crash import campaign as crash
@@ -81,10 +84,16 @@ def test_stop_names_the_runs_that_it_ends(
     for number, flow in enumerate(("collect", "label")):
         run = f"{number}0000000-0000-0000-0000-000000000000"
         run_records.begin(store.folder, run, flow, run_records.EMBEDDED, "lab")
+    runs = [
+        {"flow": flow, "due": "now", "begun": flow == "collect"} for flow in ("collect", "study")
+    ]
+    told = {"process": this_process(), "runs": runs}
+    LiveFolder(store.folder).write(WAITING, json.dumps(told))  # by the service
     outcome = requests.stop_collection(store)
     assert outcome.holder is None
-    (named,) = outcome.answer["did"]["waiting"]
-    assert named.startswith("collect of lab (")
+    named, queued = outcome.answer["did"]["waiting"]
+    assert named.startswith("collect of lab, since ")
+    assert queued == "study, due now"
     assert "ends before it moves the arm" in capsys.readouterr().err
 
 

@@ -16,7 +16,7 @@ from sliplab.flows.log import log_entries
 from sliplab.plugins.web.pages import live
 from sliplab.plugins.web.pages.live import Hub, event
 from sliplab.plugins.web.pages.web import Web
-from sliplab.plugins.web.server.service import Service
+from sliplab.storage.process import this_process
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import TrialStore
@@ -91,14 +91,15 @@ def test_page_says_what_is_wrong_with_the_store(
 def test_runs_that_wait_for_their_turn_are_shown(store: TrialStore) -> None:
     due = "2026-11-21T22:00:00+00:00"
     runs = [{"flow": flow, "due": due, "begun": flow == "study"} for flow in ("study", "collect")]
-    live_folder = LiveFolder(store.folder)
-    live_folder.watch()
-    live_folder.write(WAITING, json.dumps(runs))
-    service = Service(str(store.folder), "mock", "lab", "embedded", 1, ())
-    shown = Hub(Web(store, ACCESS, service=service))._tick(0.0)["status"]
+    told = {"process": this_process(), "runs": runs}
+    LiveFolder(store.folder).write(WAITING, json.dumps(told))
+    shown = Hub(Web(store, ACCESS))._tick(0.0)["status"]
     assert f'Waits for its turn</strong>: collect, due <time datetime="{due}">' in shown
-    assert "Starts, or waits for the rig</strong>: study" in shown
-    # of a service that is gone
+    assert "Has begun, takes no trial now</strong>: study" in shown
+    gone = {"process": {**this_process(), "ticks": 1}, "runs": runs}
+    LiveFolder(store.folder).write(
+        WAITING, json.dumps(gone)
+    )  # as a service that was killed left it
     assert "collect" not in Hub(Web(store, ACCESS))._tick(0.0)["status"]
 
 

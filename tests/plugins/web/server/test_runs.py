@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 from collections.abc import AsyncIterator, Iterator
@@ -18,7 +17,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sliplab.flows.collecting import requests
-from sliplab.flows.collecting.live_feed import WAITING, LiveFolder
+from sliplab.flows.collecting.live_feed import LiveFolder
 from sliplab.flows.running import stopping
 from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
@@ -182,7 +181,7 @@ class Queue:
 
 def waiting(store: TrialStore) -> Any:
     """What the live page is told."""
-    return json.loads(LiveFolder(store.folder).read(WAITING)[1])
+    return LiveFolder(store.folder).waiting()
 
 
 def test_a_stop_cancels_what_waits_and_would_move_the_arm(tmp_path: Path) -> None:

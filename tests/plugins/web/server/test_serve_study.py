@@ -44,7 +44,9 @@ def test_a_served_study_asks_for_the_same_trials(
     monkeypatch.setattr(
         deployments, "when_free", lambda _run_request, _patience, work, _run: work()
     )
-    here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
+    here: Any = SimpleNamespace(
+        rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store", since=None
+    )
     said = deployments._study(ScheduledStudy(extra=extra), here, None)
     assert said == "3 trials taken; report: 1 done"
     run_requests, check = asked
