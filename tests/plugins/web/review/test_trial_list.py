@@ -118,10 +118,12 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
 
 
 def test_a_port_that_is_taken_and_a_campaign_that_is_not_there(made: Reviewable) -> None:
-    from sliplab.flows.cli.app import app
+    from sliplab.flows.cli.app import command_line
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         for arguments, said in (["--port", port], "--port"), (["--campaign", "x"], "are kinematic"):
             with pytest.raises(InputError, match=said):
-                app(["review", str(made.store.folder), *arguments], standalone_mode=False)
+                command_line()(
+                    ["review", str(made.store.folder), *arguments], standalone_mode=False
+                )
