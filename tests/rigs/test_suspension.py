@@ -18,10 +18,12 @@ def test_ctrl_z_is_ctrl_c_while_a_rig_is_open(monkeypatch: pytest.MonkeyPatch) -
     build_rig(file).close()
     monkeypatch.setattr(RigFile, "in_virtual_time", False)
     rig = build_rig(file)
+    ctrl_c = signal.signal(signal.SIGINT, signal.default_int_handler)  # a server's is ignored
     try:
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTSTP)
     finally:
+        signal.signal(signal.SIGINT, ctrl_c)
         rig.close()
     assert signal.getsignal(signal.SIGTSTP) is before
 
