@@ -26,6 +26,7 @@ NAMES = (
     "network",
     "live",
     "tips",
+    "promise",
     "orchestration",
     "page",
     "acquisition",

@@ -82,6 +82,12 @@ def test_scenes(size: Size, seed: int, worlds: str) -> list[SceneDraw]:
     return list(_part("test", size.test, hash_integer("bench test", VERSION, seed), worlds))
 
 
+def other_validation(size: Size, seed: int, number: int, worlds: str) -> list[SceneDraw]:
+    """Return scenes as those that choose, in a numbered set of worlds that a seed draws."""
+    drawn_by = hash_integer("promise", VERSION, seed, number)
+    return list(_part("validation", size.validation, drawn_by, worlds))
+
+
 def nuisance_scenes(size: Size, seed: int, worlds: str = "usual") -> dict[str, list[SceneDraw]]:
     """Return scenes with each nuisance, in worlds that a seed draws."""
     drawn_by = hash_integer("bench nuisances", VERSION, seed)
