@@ -129,9 +129,13 @@ def open_session(
             _opened_rounds(run_request, store, campaign) as rounds,
             ExitStack() as opened,
         ):
-            # a motion has no planned end that is certain, so the window ends whatever runs
+            # a motion has no planned end that is certain, so the window ends whatever runs, but for
+            # a plate that hangs on the sensor: the way out would drop it
             rig = build_rig(
-                run_request.rig, lambda: stopping.requested() or supervisor.is_window_over()
+                run_request.rig,
+                lambda: (
+                    stopping.requested() or (supervisor.is_window_over() and not rig.holds_plate)
+                ),
             )
             opened.callback(rig.close)  # at once: what follows writes to the store, and may fail
             logged = LoggedContext(store, campaign.name)

@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable
 
 from sliplab.rigs.core.capabilities import (
+    Arm,
     ArmFault,
+    Clock,
     Pose,
     PoseFault,
     Segment,
@@ -25,6 +27,14 @@ pose only between pieces of a move updates it every two seconds at worst."""
 SPEED_S, SPEED_SHARE, SPEED_MM, SPEED_DEG = 0.2, 0.2, 1.0, 1.0
 """Shortest time over which a speed is measured, and by how much it may be above the limit: poses
 are noisy, and may be some packets old."""
+REST_S, REST_LOOKS, REST_LIMIT_S = 0.2, 3, 2.0
+"""Time between two looks at an arm that was stopped, over how many looks it must not have moved,
+and the longest time until it does not, s."""
+REST_MM, REST_DEG, STILL_MM, STILL_DEG = 0.2, 0.5, 0.05, 0.1
+"""Largest difference of the poses of an arm at rest over these looks: measured poses are noisy; and
+that over one look, which tells sooner."""
+POSE_AGE_S = 0.2
+"""How old a pose may be, s."""
 
 _NUMBERS = 6
 
@@ -124,3 +134,59 @@ class MotionWatch:
         turn_deg, most = angle_deg(past, pose), self._guard.turn_deg_s
         if not turn_deg <= (1.0 + SPEED_SHARE) * most * seconds + SPEED_DEG:
             raise MeasuredSpeedError("turn", turn_deg / seconds, most, "deg/s", where)
+
+
+class RestWatch:
+    """The arm at rest after a motion: leaving its place before the next one is a fault.
+
+    Args:
+        place: where it ended, or was when it was stopped.
+        now_ns: the rig's clock.
+        coasts_mm: how far it may still go in `REST_LIMIT_S`, as it brakes and poses are old.
+    """
+
+    def __init__(self, place: Pose, now_ns: Callable[[], int], coasts_mm: float = 0.0) -> None:
+        self._place, self._now_ns, self._coasts_mm = place, now_ns, coasts_mm
+        self._settled_ns = now_ns() + round(REST_LIMIT_S * 1e9)
+
+    def look(self, pose: Pose) -> None:
+        """Hold a measured pose against the place. Raises PoseFault."""
+        moved_mm, turned_deg = distance_mm(pose, self._place), angle_deg(pose, self._place)
+        if not (moved_mm <= END_MM + self._coasts_mm and turned_deg <= END_DEG):
+            raise PoseFault(
+                "arm",
+                f"moved {moved_mm:.1f} mm and {turned_deg:.1f} deg while it should rest, and was "
+                "stopped where it is: look what moves it",
+            )
+        if self._coasts_mm and self._now_ns() >= self._settled_ns:
+            self._place, self._coasts_mm = pose, 0.0
+
+
+def seen_at_rest(arm: Arm, clock: Clock) -> bool:
+    """Return whether the arm's path has ended and its poses stay.
+
+    Raises:
+        ArmFault: a pose cannot be used.
+    """
+    deadline = clock.now_ns() + round(REST_LIMIT_S * 1e9)
+    poses = [check_pose(arm.pose())]
+    while clock.now_ns() < deadline:
+        clock.wait(REST_S)
+        poses.append(check_pose(arm.pose()))
+        still = _alike(poses[-2], poses[-1], STILL_MM, STILL_DEG)
+        slow = len(poses) > REST_LOOKS and _alike(poses[-1 - REST_LOOKS], poses[-1])
+        if (still or slow) and _path_over(arm):
+            return True
+    return False
+
+
+def _alike(one: Pose, other: Pose, mm: float = REST_MM, deg: float = REST_DEG) -> bool:
+    return distance_mm(one, other) <= mm and angle_deg(one, other) <= deg
+
+
+def _path_over(arm: Arm) -> bool:
+    try:
+        progress = arm.progress()
+    except Exception:  # a driver's fault, which is reported elsewhere; its poses tell enough
+        return True
+    return progress.done or not progress.state.healthy

@@ -60,7 +60,14 @@ from sliplab.rigs.core.device_stream import DeviceStream
 from sliplab.rigs.core.force_watch import ForceLimitError, ForceWatch, PressPlaces
 from sliplab.rigs.core.gripper_check import check_move, check_state
 from sliplab.rigs.core.guard import Guard
-from sliplab.rigs.core.motion_watch import MotionWatch, check_pose, is_near
+from sliplab.rigs.core.motion_watch import (
+    POSE_AGE_S,
+    MotionWatch,
+    RestWatch,
+    check_pose,
+    is_near,
+    seen_at_rest,
+)
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.rigs.core.pulse_code import SEEDS
@@ -97,10 +104,6 @@ _STOP_RETRIES = 10
 """Attempts at a stop that Ctrl-C interrupts."""
 _SAME_SIGNAL_S = 0.2
 """Signals that follow the first one sooner are the same: a wrapper may pass Ctrl-C on once more."""
-_REST_S, _REST_LIMIT_S = 0.2, 2.0
-"""Time between two poses that must agree after a stop, and the longest time until they do, s."""
-_REST_MM, _REST_DEG = 0.05, 0.1
-"""Largest difference of two poses of an arm at rest: measured poses are noisy."""
 _CLEAR_MM = 1.0
 """Distance from the plate below which the sensor may touch it."""
 _UNWATCHED_S = 2.0
@@ -197,8 +200,8 @@ class Rig:
     """The arm's motion while it is watched."""
     _resting: Pose | None = field(default=None, init=False)
     """The end of the last motion, while the arm rests; None outside a program."""
-    _rests_at: Pose | None = field(default=None, init=False)
-    """Where the arm was seen after its last motion, and has to stay until the next."""
+    _rest: RestWatch | None = field(default=None, init=False)
+    """Where the arm has to stay from its last motion until the next."""
     _looked_ns: int = field(default=0, init=False)
     """When the moving arm was looked at last."""
     _sent: bool = field(default=False, init=False)
@@ -371,6 +374,11 @@ class Rig:
             )
 
     @property
+    def holds_plate(self) -> bool:
+        """True while the plate is released and not caught: a way out would drop it."""
+        return self._plate_uncaught
+
+    @property
     def _watches_closely(self) -> bool:
         """Return True if forces and poses are checked every `force_watch.POLL_S`.
 
@@ -419,8 +427,11 @@ class Rig:
         return min(speed_mm_s, self.guard.speed_mm_s)
 
     @contextmanager
-    def moving(self, segment: Segment) -> Iterator[None]:
+    def moving(self, segment: Segment, *, leaving: bool = False) -> Iterator[None]:
         """Send one segment to the arm, and watch forces and poses while the block waits.
+
+        Args:
+            leaving: it leads clear of the plate, which unloads the sensor.
 
         Raises:
             GuardError: a limit forbids the segment, and nothing was sent; or the arm's pose left
@@ -430,21 +441,24 @@ class Rig:
         begin = self.pose()
         unzeroed = not self._zeroed and self.force is not None and self.force.zeroing == "trial"
         if self._watches_closely and self.force is not None and (self._forces is None or unzeroed):
-            self._watch_forces(turns=angle_deg(begin, segment.to) > _TURN_DEG)
+            turns = angle_deg(begin, segment.to) > _TURN_DEG
+            self._watch_forces(turns=turns, leaving=leaving)
         self._send(segment, begin)
         try:
             yield
         finally:
             self._motion, self._resting = None, segment.to
 
-    def rests_here(self) -> None:
-        """Note where the arm stopped: leaving it before the next motion is a fault."""
+    def rests_here(self, speed_mm_s: float) -> None:
+        """Note where the arm was stopped in a motion: leaving it before the next one is a fault."""
         if self._watches_closely:
-            self._rests_at = self.pose()
+            stop_s = self.arm.stopping_s(speed_mm_s) if isinstance(self.arm, StoppingArm) else 0.0
+            coasts_mm = speed_mm_s * (2 * stop_s + POSE_AGE_S)
+            self._rest = RestWatch(self.pose(), self.clock.now_ns, coasts_mm)
 
     def _send(self, segment: Segment, begin: Pose) -> None:
         """Check a segment, and send it: the one place from which the arm receives its motion."""
-        self._resting = self._rests_at = None
+        self._resting = self._rest = None
         self.guard.check_segment(begin, segment, self.plate_frame, self._closed_mm)
         self._sent, self._looked_ns = True, self.clock.now_ns()
         self.arm.start([segment])
@@ -586,7 +600,7 @@ class Rig:
                 state = self.arm.state()
                 if not state.healthy:  # the arm was stopped; the taught plane may still be right
                     raise arm_fault(state, "touching off")
-        self.rests_here()
+        self.rests_here(speed_mm_s)
         surface = rate.surface_mm(speed_mm_s)
         if surface is not None and abs(surface - self.touch_mm) <= search_mm:
             return surface - self.touch_mm
@@ -731,12 +745,15 @@ class Rig:
         phase: str,
         sink: Sink | None,
         left_s: Callable[[], float] | None = None,
+        *,
+        leaving: bool = False,
     ) -> tuple[int, int, bool]:
         """Send one segment of known duration, and wait for its end, or stop it on the way.
 
         Args:
             left_s: time until the arm has to be stopped, s; asked every `force_watch.POLL_S`, and
                 again when half of it is over.
+            leaving: as `moving`.
 
         Returns:
             start and end, controller times in ns, and True where it was stopped on the way.
@@ -746,7 +763,7 @@ class Rig:
             if self._watches_closely:
                 self._check_end(segment, phase, sink)
             return start, start, False
-        with self.moving(segment):
+        with self.moving(segment, leaving=leaving):
             deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
             while not (progress := self.arm.progress()).done:
                 if not progress.state.healthy:
@@ -765,14 +782,14 @@ class Rig:
                 self.wait(max(min(most, left), 1e-3), sink)
             self._note_look()
         if stopped_ns is not None:
-            self.rests_here()
+            self.rests_here(segment.speed_mm_s)
             return start, stopped_ns, True
         if not progress.state.healthy:
             raise arm_fault(progress.state, phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{phase}'")
         self._check_end(segment, phase, sink)
-        self._rests_at = segment.to
+        self._rest = RestWatch(segment.to, self.clock.now_ns)
         return *progress.finished[-1], False
 
     def _check_end(self, segment: Segment, phase: str, sink: Sink | None) -> None:
@@ -824,13 +841,8 @@ class Rig:
             elif resting is not None:  # no motion was sent, but another program may send one
                 pose, plate = self.pose(), self.plate_frame
                 self.guard.check_measured(pose, resting, plate, self._closed_mm, "at rest")
-                if self._rests_at is not None and not is_near(pose, self._rests_at):
-                    raise PoseFault(
-                        "arm",
-                        f"moved {distance_mm(pose, self._rests_at):.1f} mm and "
-                        f"{angle_deg(pose, self._rests_at):.1f} deg while it should rest, and was "
-                        "stopped where it is: look what moves it",
-                    )
+                if self._rest is not None:
+                    self._rest.look(pose)
 
     def _look(self, motion: MotionWatch) -> None:
         """Hold the moving arm's pose against its motion, its limits and the forces."""
@@ -948,12 +960,18 @@ class Rig:
         cleared, or a way out that was interrupted.
         """
         begin, at = self.pose(), self.position()
-        if at.depth_mm <= max(home.depth_mm, -_CLEAR_MM):
-            return
-        out = self.plate_frame.pose(Position(at.x_mm, at.y_mm, home.depth_mm))
-        speed_mm_s = self.at_most(RETRACT_SPEED_MM_S)
-        segment = Segment(replace(out, rotvec_deg=begin.rotvec_deg), speed_mm_s)
-        self._follow(segment, (at.depth_mm - home.depth_mm) / speed_mm_s, "come clear", None)
+        if not self._is_clear(at):
+            depth_mm = min(home.depth_mm, -_CLEAR_MM) - self._closed_mm
+            out = self.plate_frame.pose(Position(at.x_mm, at.y_mm, depth_mm))
+            speed_mm_s = self.at_most(RETRACT_SPEED_MM_S)
+            segment = Segment(replace(out, rotvec_deg=begin.rotvec_deg), speed_mm_s)
+            seconds = (at.depth_mm - depth_mm) / speed_mm_s
+            self._follow(segment, seconds, "come clear", None, leaving=True)
+        self._open_fingers()  # closed ones add to the depth of the way home
+
+    def _is_clear(self, at: Position) -> bool:
+        """Return whether the sensor cannot touch the plate there."""
+        return at.depth_mm + self._closed_mm <= -_CLEAR_MM
 
     def _turn_back(self, home: Position) -> None:
         """Turn a turned sensor back on the spot, where the way home is too short to do it there.
@@ -1083,9 +1101,12 @@ class Rig:
                     fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
                 raise self._with_plate_warning(fault) from error
             held = isinstance(error, StaysInContact) and error.plate_held
-            uncaught = self._plate_uncaught and not held
-            if uncaught and isinstance(error, RigError):
-                raise self._with_plate_warning(error) from error
+            if self._plate_uncaught and not held:
+                if isinstance(error, RigError):
+                    raise self._with_plate_warning(error) from error
+                if isinstance(error, StopRequested | KeyboardInterrupt):
+                    stopped = RigError("plate", "the trial was stopped")
+                    raise self._with_plate_warning(stopped) from error
             raise
         self._resting = None
         with suppress(Exception):  # the motion is over
@@ -1110,7 +1131,7 @@ class Rig:
                 if self.gripper is not None:
                     with suppress(Exception):
                         self.gripper.stop()
-                if not self._sent or self._seen_at_rest():
+                if not self._sent or seen_at_rest(self.arm, self.clock):
                     self._sent = False
                     return None
                 moving += 1
@@ -1124,34 +1145,15 @@ class Rig:
                 return ArmFault("arm", "was stopped twice, and moves on: press the emergency stop")
         return ArmFault("arm", "could not be confirmed at rest: its stop was interrupted")
 
-    def _seen_at_rest(self) -> bool:
-        """Return whether the arm's path has ended and two poses after it agree. Raises ArmFault."""
-        deadline = self.clock.now_ns() + round(_REST_LIMIT_S * 1e9)
-        before = self.pose()
-        while self.clock.now_ns() < deadline:
-            self.clock.wait(_REST_S)
-            here = self.pose()
-            same = distance_mm(before, here) <= _REST_MM and angle_deg(before, here) <= _REST_DEG
-            if same and self._path_over():
-                return True
-            before = here
-        return False
-
-    def _path_over(self) -> bool:
-        try:
-            return self.arm.progress().done
-        except RigError:  # it was aborted, for the reason that is reported already
-            return True
-
     def _left_in_contact(self) -> RigError | None:
         """Return the error for a way out that a person prevented; None where the arm is clear."""
-        depth_mm = self.position().depth_mm
-        if depth_mm <= -_CLEAR_MM:
+        at = self.position()
+        if self._is_clear(at):
             return None
         return ArmFault(
             "arm",
             f"did not come clear of the plate: its way out was interrupted at a depth of "
-            f"{depth_mm:.2f} mm; look at it: the next trial begins with the way straight out",
+            f"{at.depth_mm:.2f} mm; look at it: the next trial begins with the way straight out",
         )
 
     def _retract(self, clear: Position, error: BaseException) -> RigError | None:

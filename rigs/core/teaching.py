@@ -261,7 +261,7 @@ def _creep(rig: Rig, clear: Position, deepest: Position, detector: _TouchDetecto
             if rig.clock.now_ns() > deadline:
                 raise ArmFault("arm", "did not finish creeping in time")
         rig.arm.stop()
-    rig.rests_here()
+    rig.rests_here(detector.speed_mm_s)
     state = rig.arm.state()
     if not state.healthy:  # a stopped arm finds no plate, though the taught plane may be right
         raise arm_fault(state, "creeping")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,21 @@ import pytest
 
 from sliplab.protocols import load_plan
 from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.rigs.build import build_rig
 from sliplab.rigs.core import rig as rig_module
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, PoseFault, RigError, Segment
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    ArmState,
+    Pose,
+    PoseFault,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.rigs.core.motion_watch import RestWatch, seen_at_rest
 from sliplab.rigs.core.plate_frame import turned_about_z
 from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.streams import NullSink
 from tests.conftest import ROOT
 from tests.patching import loose, put
@@ -434,6 +446,88 @@ def test_ctrl_c_while_a_device_is_closed_closes_the_others() -> None:
     closed = [call for call in notes if call.endswith("close")]
     assert closed == ["arm.close", "events.close", "frames.close", "sync.close"]
     assert ended == ["files"]
+
+
+def noisy(rig: Rig, sd_mm: float) -> None:
+    """Give poses the noise of a measurement."""
+    rng, pose = np.random.default_rng(1), rig.arm.pose
+
+    def measured() -> Pose:
+        true = pose()
+        x, y, z = (np.array(true.xyz_mm) + rng.normal(0.0, sd_mm, 3)).tolist()
+        return Pose((x, y, z), true.rotvec_deg)
+
+    put(rig.arm, "pose", measured)
+
+
+@pytest.mark.parametrize("sd_mm", [0.0, 0.05, 0.08])
+def test_noise_of_poses_is_no_motion_of_a_stopped_arm(sd_mm: float) -> None:
+    for _ in range(5):
+        rig = real()
+        interrupted_at(rig, lambda rig=rig: in_slide(rig))
+        noisy(rig, sd_mm)
+        with pytest.raises(KeyboardInterrupt):
+            run_program(rig)
+        assert rig.position().depth_mm == pytest.approx(-2.0, abs=0.5)
+
+
+def test_slow_motion_is_seen_after_a_stop_that_does_nothing() -> None:
+    rig = real("stop")
+    rig.arm.start([Segment(rig.plate_frame.pose(Position(5.0, 0.0, -2.0)), 0.3)])
+    assert not seen_at_rest(rig.arm, rig.clock)
+
+
+def test_an_arm_in_protective_stop_rests_whatever_its_path_says() -> None:
+    rig = real()
+    put(rig.arm, "progress", lambda: Progress(ArmState.PROTECTIVE_STOP, (), False))
+    assert seen_at_rest(rig.arm, rig.clock)
+
+
+def test_an_arm_may_brake_after_its_stop_and_then_has_to_rest() -> None:
+    now_ns, away = [0], Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    watch = RestWatch(away, lambda: now_ns[0], coasts_mm=2.0)
+    watch.look(replace(away, xyz_mm=(2.9, 0.0, 0.0)))
+    now_ns[0] = 2_000_000_000
+    watch.look(replace(away, xyz_mm=(2.9, 0.0, 0.0)))
+    watch.look(replace(away, xyz_mm=(3.8, 0.0, 0.0)))
+    with pytest.raises(PoseFault, match=r"moved 1\.1 mm and 0\.0 deg while it should rest"):
+        watch.look(replace(away, xyz_mm=(4.0, 0.0, 0.0)))
+
+
+def test_whoever_stops_a_trial_is_told_of_the_plate_that_hangs() -> None:
+    rig = real()
+    steps = (*SLIDE.steps[:2], PlateStep("plate", "release", 1.0), *SLIDE.steps[2:])
+    interrupted_at(rig, lambda: rig.holds_plate)
+    with pytest.raises(RigError, match=r"plate: the trial was stopped\. The plate was released"):
+        rig.run_trial(Program(HOME, steps), NullSink(), 1, None, 100)
+
+
+def test_a_small_clearance_is_not_clear() -> None:
+    """The arm turns and slides only where the sensor cannot touch."""
+    rig, places = real(), list[Position]()
+    placed(rig, Position(-8.0, 0.0, -3.0), Position(-8.0, 0.0, 1.0))
+    start = rig.arm.start
+
+    def noted(path: Any) -> None:
+        places.append(rig.plate_frame.position(path[0].to.xyz_mm))
+        start(path)
+
+    put(rig.arm, "start", noted)
+    rig.begin_trial(Position(0.0, 0.0, -0.05), 1)
+    assert [round(place.depth_mm, 6) for place in places] == [-1.0, -0.05]
+    assert [round(place.x_mm, 6) for place in places] == [-8.0, 0.0]
+
+
+def test_closed_fingers_are_opened_before_the_way_home() -> None:
+    rig = build_rig(load_rig_file(Path("mock-gripper"))[0])
+    rig.connect()
+    allowed = loose(rig.gripper).range
+    loose(rig.gripper).move(rig.grip_opening_mm - 8.0, allowed.speed_mm_s[1], allowed.force_n[0])
+    rig.clock.wait(5.0)
+    rig.connect()
+    placed(rig, Position(0.0, 0.0, -60.0))
+    rig.begin_trial(HOME, 1)
+    assert loose(rig.gripper).state().opening_mm == pytest.approx(rig.grip_opening_mm, abs=0.6)
 
 
 def run_program(rig: Rig) -> None:
