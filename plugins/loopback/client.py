@@ -95,10 +95,12 @@ class Loopback:
     def close(self) -> None:
         """End the fakes; safe to call more than once."""
         self._calls.close()
-        self._process.join(END_S)
-        if self._process.is_alive():
-            self._process.kill()
+        with suppress(ValueError):  # it has been closed before, or does not end
             self._process.join(END_S)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join(END_S)
+            self._process.close()  # its pipes would stay open until the garbage is collected
         self._frames.close()
 
     def reached_by(self, file: RigFile) -> RigFile:
