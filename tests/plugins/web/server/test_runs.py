@@ -22,6 +22,7 @@ from sliplab.flows.running import stopping
 from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
+from sliplab.plugins.web.server.waiting_runs import drop_unplanned
 from sliplab.storage.files import read_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials import control
@@ -242,6 +243,53 @@ def test_what_waits_ends_with_the_service(tmp_path: Path, monkeypatch: pytest.Mo
     asyncio.run(end())
     assert client.said == {client.runs[0].id: "CANCELLED: the service ended before it began"}
     assert waiting(store) == []
+
+
+class Planner(Queue):
+    """Prefect's server, with schedules: with one, it deletes the runs that schedules planned."""
+
+    def __init__(self, flow: str, *slugs: str) -> None:
+        super().__init__(flow)
+        self.slugs = list(slugs)
+
+    async def read_flow_runs(self, *of: Any, offset: int, **to: Any) -> list[Any]:
+        return self.runs[offset:]
+
+    async def read_deployment_schedules(self, deployment: UUID) -> list[Any]:
+        return [SimpleNamespace(id=slug, slug=slug) for slug in self.slugs]
+
+    async def delete_deployment_schedule(self, deployment: UUID, slug: str) -> None:
+        self.slugs.remove(slug)
+        self.runs = [run for run in self.runs if not run.auto_scheduled]
+
+    async def create_flow_run_from_deployment(
+        self, deployment: UUID, *, parameters: Any, state: Any, tags: list[str]
+    ) -> None:
+        run = self.due(deployment)
+        run.parameters, run.tags = parameters, tags
+        run.expected_start_time = state.state_details.scheduled_time
+        self.runs.append(run)
+
+
+def test_a_night_that_has_begun_is_made_again_once() -> None:
+    client = Planner("collect", "night", "old", "older")
+    (night,) = client.runs
+    begin = night.expected_start_time = datetime.now(UTC).replace(second=0, microsecond=0)
+    night.auto_scheduled, night.parameters = True, {"wanted": {"trials": 20}}
+    item = Scheduled(
+        name="night",
+        flow="collect",
+        cron=f"{begin.minute} {begin.hour} * * *",
+        timezone="UTC",
+        active=True,
+        parameters={"trials": 20},
+    )
+    asyncio.run(drop_unplanned(client, client.flows, [item]))
+    (again,) = client.runs
+    assert (again.expected_start_time, again.auto_scheduled) == (begin, False)
+    client.slugs.append("oldest")  # another service's, before the next restart
+    asyncio.run(drop_unplanned(client, client.flows, [item]))
+    assert client.runs == [again]
 
 
 def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
