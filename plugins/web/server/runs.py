@@ -110,17 +110,24 @@ class ServedRuns:
             if run.state.is_pending():
                 await self._start(run)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
-        due = await self._without_stopped(client, await self._due(client))
-        waiting = []
-        for run in due:
+        due = await self._due(client)
+        for run in due:  # first: a stop must not wait for the store's disk
             if run.deployment_id in self._control and run.id not in self._words:
                 flow, context = self._control[run.deployment_id], contextvars.copy_context()
                 self._words[run.id] = asyncio.get_running_loop().run_in_executor(
                     threads, context.run, _carry_out_here, flow, run
                 )
-            elif run.deployment_id in self._on_rig and self._process is not None:
+        due = [run for run in due if run.deployment_id in self._on_rig]
+        held = False
+        try:
+            due = await self._without_stopped(client, due)
+        except OSError:  # the disk's, or that it does not answer: a stop may be unread
+            held = True
+        waiting = []
+        for run in due:
+            if held or self._process is not None:
                 waiting.append(run)
-            elif run.deployment_id in self._on_rig:
+            else:
                 by_schedule = is_by_schedule(run)
                 begins = await begin_of_run(run, self._schedules) if by_schedule else None
                 if begins is None or begins <= datetime.now(UTC):

@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -290,6 +291,35 @@ def test_a_night_that_has_begun_is_made_again_once() -> None:
     client.slugs.append("oldest")  # another service's, before the next restart
     asyncio.run(drop_unplanned(client, client.flows, [item]))
     assert client.runs == [again]
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), TimeoutError()])
+def test_a_stop_of_the_page_does_not_wait_for_the_disk(
+    error: OSError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing begins meanwhile: whether another person stopped it cannot be read."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect", "stop")
+    rig, stop = ({run: flow} for run, flow in client.flows.items())
+    served, done, begun = ServedRuns(store.folder, rig, stop), list[Any](), list[Any]()
+    monkeypatch.setattr(runs, "_carry_out_here", lambda flow, run: done.append(flow.name))
+
+    async def begin(client: Any, run: Any) -> None:
+        begun.append(run)
+
+    served._begin = begin
+
+    def unreadable(store: TrialStore) -> int:
+        raise error
+
+    with monkeypatch.context() as broken, ThreadPoolExecutor() as threads:
+        broken.setattr(runs, "last_number", unreadable)
+        asyncio.run(served._look(client, threads))
+    assert done == ["stop"]
+    assert begun == []
+    assert [run["flow"] for run in waiting(store)] == ["collect"]
+    client.runs.pop()
+    asyncio.run(served._look(client, None))
+    assert begun == client.runs
 
 
 def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
