@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import threading
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
@@ -24,7 +25,7 @@ from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
 from sliplab.plugins.web.server.waiting_runs import drop_unplanned
-from sliplab.storage.files import read_json
+from sliplab.storage.files import read_json, write_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import TrialStore
@@ -166,6 +167,7 @@ class Queue:
             auto_scheduled=False,
             tags=[],
             parameters={},
+            created=datetime.now(UTC),
             expected_start_time=datetime.now(UTC),
         )
 
@@ -320,6 +322,77 @@ def test_a_stop_of_the_page_does_not_wait_for_the_disk(
     client.runs.pop()
     asyncio.run(served._look(client, None))
     assert begun == client.runs
+
+
+def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
+    """The stop is read late: the server was lost. What had waited is cancelled by any clock."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
+    served, threads, begun = ServedRuns(store.folder, client.flows, {}), None, list[Any]()
+
+    async def begin(client: Any, run: Any) -> None:
+        begun.append(run)
+
+    async def supervise(client: Any) -> None:
+        pass
+
+    served._begin, served._supervise = begin, supervise
+    served._process, served._run = SimpleNamespace(returncode=None), client.runs[0]
+    (waited,) = client.runs
+    waited.created += timedelta(hours=1)  # the clock was set back
+    asyncio.run(served._look(client, threads))
+    early = client.due(waited.deployment_id)
+    control.ask(store, "stop", who="anna")
+    stop = datetime.fromisoformat(control.ask(store, "stop", who="ben").when)
+    between, later, unknown = (client.due(waited.deployment_id) for _ in range(3))
+    between.created = stop + timedelta(seconds=0.9)  # it is told to a second
+    later.created, unknown.created = stop + timedelta(seconds=1), None
+    client.runs += [early, between, later, unknown]
+    served._process = None
+    asyncio.run(served._look(client, threads))
+    assert client.said.keys() == {waited.id, early.id, between.id, unknown.id}
+    assert begun == [later]
+    assert control.stop_after(store, served._looked) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"host": "elsewhere"}, {"when": "noon"}, {"when": "2026-01-01T00:00:00"}]
+)
+def test_a_stop_whose_time_says_little_cancels_all(change: dict[str, str], tmp_path: Path) -> None:
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
+    served, threads = ServedRuns(store.folder, client.flows, {}), None
+    control.ask(store, "stop", who="anna")
+    path = store.folder / control.FOLDER / "000001.json"
+    write_json(path, {**read_json(path), **change})
+    client.runs[0].created += timedelta(hours=1)
+    asyncio.run(served._look(client, threads))
+    assert len(client.said) == 1
+
+
+def test_nothing_begins_while_a_stop_of_the_page_is_carried_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its request comes later: a process that begins now would find it, and end itself."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect", "stop")
+    rig, stop = ({run: flow} for run, flow in client.flows.items())
+    served, noted = ServedRuns(store.folder, rig, stop), threading.Event()
+
+    def carry_out(flow: Any, run: Any) -> None:
+        noted.wait(5)
+        control.ask(store, "stop", who="anna")
+
+    async def looks(threads: Any) -> None:
+        for _ in range(2):
+            await served._look(client, threads)
+        assert client.said == {}
+        noted.set()
+        await asyncio.wait(served._words.values())
+        client.runs.pop()
+        await served._look(client, threads)
+
+    monkeypatch.setattr(runs, "_carry_out_here", carry_out)
+    with ThreadPoolExecutor() as threads:
+        asyncio.run(looks(threads))
+    assert [said[:24] for said in client.said.values()] == ["CANCELLED: with the stop"]
 
 
 def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
