@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -53,7 +54,8 @@ class CollectionSupervisor:
     Attributes:
         wait: waits some seconds, and answers stop requests.
         listener: notified of pauses.
-        clock: returns seconds since 1970; decides when the window ends.
+        clock: returns seconds since 1970; passed_s: those since this object was made, of a clock
+            that nobody sets. The window ends when either says so.
         in_real_time: False for a rig in virtual time, on which nothing moves that could be late.
     """
 
@@ -71,6 +73,10 @@ class CollectionSupervisor:
         self.wait: Callable[[float], None] = stopping.wait
         self.listener = listener
         self.clock: Callable[[], float] = time.time
+        began_s = time.monotonic()
+        self.passed_s: Callable[[], float] = lambda: time.monotonic() - began_s
+        self._until = math.inf if run_request.until is None else run_request.until
+        self._window_s = self._until - self.clock()
         self.in_real_time = not run_request.rig.in_virtual_time
         self._seen: frozenset[str] = frozenset()
         self._paused: ControlRequest | None = None
@@ -114,19 +120,21 @@ class CollectionSupervisor:
         Raises:
             WindowOver: it does not.
         """
-        until = self._run_request.until
-        if until is None:
+        if self._run_request.until is None:
             return
         planned = (
             preparation_s + self._run_request.plan.seconds(trial) if self.in_real_time else 0.0
         )
-        if self.clock() + planned > until:
+        if self._late_s() + planned > 0:
             raise self.window_over(f"too soon for {trial.id}")
 
     def is_window_over(self) -> bool:
         """Return whether the window has ended: the arm must rest, whatever it does."""
-        until = self._run_request.until
-        return until is not None and self.in_real_time and self.clock() > until
+        return self.in_real_time and self._late_s() > 0
+
+    def _late_s(self) -> float:
+        """Return the time since the window's end, s, by the clock that is further."""
+        return max(self.clock() - self._until, self.passed_s() - self._window_s)
 
     def window_over(self, what: str) -> WindowOver:
         """Return the error that says when the window ends, what that means, and what follows."""

@@ -98,10 +98,10 @@ def last_number(store: TrialStore) -> int:
 
 
 def stop_after(store: TrialStore, number: int) -> ControlRequest | None:
-    """Return a stop that was requested after request `number`, answered or not; None without."""
+    """Return the last stop requested after request `number`, answered or not; None without."""
     if last_number(store) <= number:
         return None
-    later = (item for item in requests(store) if item.number > number)
+    later = (item for item in reversed(requests(store)) if item.number > number)
     return next((item for item in later if item.kind == "stop"), None)
 
 

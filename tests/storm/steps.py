@@ -217,10 +217,12 @@ def night(process: Process, step: dict[str, Any]) -> None:
     if not request.due_trials(store.campaign(request.campaign)):
         refresh(request)
         return
+    began_s = host.passed_s
     with open_session(request, _Listener(notes, witness)) as session, stopping.signals():
         witness.watch(session.supervisor, request.plan)
         session.supervisor.wait = partial(_wait, host)
         session.supervisor.clock = lambda: host.wall_s
+        session.supervisor.passed_s = lambda: host.passed_s - began_s
         rig = session.collector.rig
         close = rig.close
 

@@ -12,12 +12,13 @@ import asyncio
 import contextvars
 import json
 import os
+import socket
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -71,6 +72,8 @@ class ServedRuns:
         self._process: asyncio.subprocess.Process | None = None
         self._stop_by: float | None = None
         self._words: dict[UUID, asyncio.Future[None]] = {}
+        self._stops: list[asyncio.Future[None]] = []
+        self._seen: set[UUID] = set()
 
     async def carry_out(self, poll_s: float, over: asyncio.Event) -> None:
         """Carry out what the page asks for until `over`; then what runs is stopped, arm first.
@@ -110,17 +113,27 @@ class ServedRuns:
             if run.state.is_pending():
                 await self._start(run)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
-        due = await self._without_stopped(client, await self._due(client))
-        waiting = []
-        for run in due:
+        self._stops = [stop for stop in self._stops if not stop.done()]
+        due = await self._due(client)
+        for run in due:  # first: a stop must not wait for the store's disk
             if run.deployment_id in self._control and run.id not in self._words:
                 flow, context = self._control[run.deployment_id], contextvars.copy_context()
                 self._words[run.id] = asyncio.get_running_loop().run_in_executor(
                     threads, context.run, _carry_out_here, flow, run
                 )
-            elif run.deployment_id in self._on_rig and self._process is not None:
+                if flow.name == "stop":
+                    self._stops.append(self._words[run.id])
+        due = [run for run in due if run.deployment_id in self._on_rig]
+        held = bool(self._stops)  # one that is not among the store's requests yet
+        try:
+            due = await self._without_stopped(client, due)
+        except OSError:  # the disk's, or that it does not answer: a stop may be unread
+            held = True
+        waiting = []
+        for run in due:
+            if held or self._process is not None:
                 waiting.append(run)
-            elif run.deployment_id in self._on_rig:
+            else:
                 by_schedule = is_by_schedule(run)
                 begins = await begin_of_run(run, self._schedules) if by_schedule else None
                 if begins is None or begins <= datetime.now(UTC):
@@ -137,16 +150,19 @@ class ServedRuns:
         """Cancel what would move the arm after a person's stop; return the other runs."""
         async with asyncio.timeout(DISK_S):
             number, stop = await asyncio.to_thread(self._requests)
-        if stop is not None:
-            for run in due:
-                if run.deployment_id in self._moving:
-                    await cancel(client, run, f"with the {stop}")
-            due = [run for run in due if run.deployment_id not in self._moving]
+        left = []
+        for run in due:
+            later = stop is None or (run.id not in self._seen and _is_later(run, stop))
+            if later or run.deployment_id not in self._moving:
+                left.append(run)
+            else:
+                await cancel(client, run, f"with the {stop}")
         self._looked = max(number, stop.number if stop else 0)
-        return due
+        self._seen = {run.id for run in left}  # a stop that comes now is meant for these
+        return left
 
     def _requests(self) -> tuple[int, ControlRequest | None]:
-        """Return the number of the last request, and the first stop that was not looked at yet."""
+        """Return the number of the last request, and the last stop that was not looked at yet."""
         store = TrialStore(self._store)
         return last_number(store), stop_after(store, self._looked)
 
@@ -234,6 +250,15 @@ class ServedRuns:
             self._terminate()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._process.wait(), 1.0)
+
+
+def _is_later(run: Any, stop: ControlRequest) -> bool:
+    """Return whether a run was surely created after a stop, whose time is told to a second."""
+    try:
+        after = datetime.fromisoformat(stop.when) + timedelta(seconds=1)
+        return stop.host == socket.gethostname() and bool(run.created >= after)
+    except (ValueError, TypeError):  # it is none, or has no zone
+        return False
 
 
 def _carry_out_here(flow: Any, run: Any) -> None:

@@ -59,7 +59,8 @@ async def drop_unplanned(
                 await client.delete_flow_run(run.id)
         # with a schedule, the server deletes the late runs of all others: a night that has begun
         for run in planned:
-            if old and run.expected_start_time <= datetime.now(UTC):
+            late = run.expected_start_time <= datetime.now(UTC)
+            if old and run.auto_scheduled and late:  # else it was made again, and is still there
                 await client.create_flow_run_from_deployment(
                     deployment,
                     parameters=run.parameters,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -219,12 +221,17 @@ def after(calls: int, before: float = 0.0, then: float = 1000.0) -> Callable[[],
     return lambda: next(times, then)
 
 
+def show(supervisor: CollectionSupervisor, clock: Callable[[], float]) -> None:
+    """Let another clock alone say when the window ends."""
+    supervisor.clock, supervisor.passed_s = clock, lambda: -math.inf
+
+
 def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> None:
     wanted = crash.run_request(tmp_path, 4)
 
     def night() -> None:
         with open_session(replace(wanted, until=500.0)) as work:
-            work.supervisor.clock = after(7)  # an attempt asks three times
+            show(work.supervisor, after(7))  # an attempt asks three times
             work.collector.rig.connect()
             work.collector.take(work.trials)
 
@@ -255,7 +262,8 @@ class Night:
     def take(self, wanted: RunRequest) -> None:
         """Collect until the window ends."""
         with open_session(replace(wanted, until=self.until)) as work:
-            work.supervisor.in_real_time, work.supervisor.clock = True, lambda: self.at_s
+            work.supervisor.in_real_time = True
+            show(work.supervisor, lambda: self.at_s)
             rig = work.collector.rig
             wait, start = rig.clock.wait, rig.arm.start
 
@@ -322,7 +330,8 @@ def test_a_window_may_end_while_a_person_is_asked(tmp_path: Path) -> None:
     session(tmp_path / "a", data)
     wanted = requested(tmp_path / "a")
     with open_session(replace(wanted, until=1000.0)) as work:
-        work.supervisor.in_real_time, work.supervisor.clock = True, lambda: now
+        work.supervisor.in_real_time = True
+        show(work.supervisor, lambda: now)
         now, rig = 0.0, work.collector.rig
         ask = rig.operator.ask
 
@@ -342,7 +351,8 @@ def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:
     wanted = replace(crash.run_request(tmp_path, 2), until=500.0)
     with open_session(wanted) as work:
         control.ask(TrialStore.open(wanted.store), "pause")
-        work.supervisor.clock, work.supervisor.wait = after(3), lambda seconds: None
+        show(work.supervisor, after(3))
+        work.supervisor.wait = lambda seconds: None
         with pytest.raises(WindowOver):
             work.collector.take(work.trials)
     assert control.paused(TrialStore.open(wanted.store)) is not None
@@ -357,8 +367,28 @@ def test_in_real_time_no_trial_is_begun_that_would_not_be_over(tmp_path: Path) -
         supervisor = CollectionSupervisor(wanted, store, describe_campaign(store, wanted))
         trial = wanted.plan.trials[0]
         seconds = wanted.plan.seconds(trial) if needed is None else needed
-        supervisor.clock = lambda seconds=seconds: 499.9 - seconds
+        show(supervisor, lambda seconds=seconds: 499.9 - seconds)
         assert supervisor.may_take(trial)
-        supervisor.clock = lambda seconds=seconds: 500.1 - seconds
+        show(supervisor, lambda seconds=seconds: 500.1 - seconds)
         with pytest.raises(WindowOver, match=trial.id):
             supervisor.may_take(trial)
+
+
+def test_a_clock_that_is_set_back_does_not_lengthen_the_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = replace(crash.run_request(tmp_path, 2), until=10_600.0)
+    store = TrialStore.create(wanted.store)
+    campaign, wall_s, passed_s = describe_campaign(store, wanted), 10_000.0, 50.0
+    monkeypatch.setattr(time, "time", lambda: wall_s + passed_s - 50.0)
+    monkeypatch.setattr(time, "monotonic", lambda: passed_s)
+    supervisor = CollectionSupervisor(wanted, store, campaign)
+    supervisor.in_real_time, trial = True, wanted.plan.trials[0]
+    wall_s -= 3600.0
+    assert supervisor.may_take(trial)
+    passed_s = 651.0 - wanted.plan.seconds(trial)
+    assert not supervisor.is_window_over()
+    with pytest.raises(WindowOver, match=trial.id):
+        supervisor.may_take(trial)
+    passed_s = 651.0
+    assert supervisor.is_window_over()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import threading
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,7 +24,8 @@ from sliplab.flows.running import stopping
 from sliplab.plugins.web.server import runs
 from sliplab.plugins.web.server.runs import ServedRuns
 from sliplab.plugins.web.server.schedules import Scheduled
-from sliplab.storage.files import read_json
+from sliplab.plugins.web.server.waiting_runs import drop_unplanned
+from sliplab.storage.files import read_json, write_json
 from sliplab.storage.remote.objects import LAYOUT_FILE
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import TrialStore
@@ -164,6 +167,7 @@ class Queue:
             auto_scheduled=False,
             tags=[],
             parameters={},
+            created=datetime.now(UTC),
             expected_start_time=datetime.now(UTC),
         )
 
@@ -242,6 +246,153 @@ def test_what_waits_ends_with_the_service(tmp_path: Path, monkeypatch: pytest.Mo
     asyncio.run(end())
     assert client.said == {client.runs[0].id: "CANCELLED: the service ended before it began"}
     assert waiting(store) == []
+
+
+class Planner(Queue):
+    """Prefect's server, with schedules: with one, it deletes the runs that schedules planned."""
+
+    def __init__(self, flow: str, *slugs: str) -> None:
+        super().__init__(flow)
+        self.slugs = list(slugs)
+
+    async def read_flow_runs(self, *of: Any, offset: int, **to: Any) -> list[Any]:
+        return self.runs[offset:]
+
+    async def read_deployment_schedules(self, deployment: UUID) -> list[Any]:
+        return [SimpleNamespace(id=slug, slug=slug) for slug in self.slugs]
+
+    async def delete_deployment_schedule(self, deployment: UUID, slug: str) -> None:
+        self.slugs.remove(slug)
+        self.runs = [run for run in self.runs if not run.auto_scheduled]
+
+    async def create_flow_run_from_deployment(
+        self, deployment: UUID, *, parameters: Any, state: Any, tags: list[str]
+    ) -> None:
+        run = self.due(deployment)
+        run.parameters, run.tags = parameters, tags
+        run.expected_start_time = state.state_details.scheduled_time
+        self.runs.append(run)
+
+
+def test_a_night_that_has_begun_is_made_again_once() -> None:
+    client = Planner("collect", "night", "old", "older")
+    (night,) = client.runs
+    begin = night.expected_start_time = datetime.now(UTC).replace(second=0, microsecond=0)
+    night.auto_scheduled, night.parameters = True, {"wanted": {"trials": 20}}
+    item = Scheduled(
+        name="night",
+        flow="collect",
+        cron=f"{begin.minute} {begin.hour} * * *",
+        timezone="UTC",
+        active=True,
+        parameters={"trials": 20},
+    )
+    asyncio.run(drop_unplanned(client, client.flows, [item]))
+    (again,) = client.runs
+    assert (again.expected_start_time, again.auto_scheduled) == (begin, False)
+    client.slugs.append("oldest")  # another service's, before the next restart
+    asyncio.run(drop_unplanned(client, client.flows, [item]))
+    assert client.runs == [again]
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), TimeoutError()])
+def test_a_stop_of_the_page_does_not_wait_for_the_disk(
+    error: OSError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing begins meanwhile: whether another person stopped it cannot be read."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect", "stop")
+    rig, stop = ({run: flow} for run, flow in client.flows.items())
+    served, done, begun = ServedRuns(store.folder, rig, stop), list[Any](), list[Any]()
+    monkeypatch.setattr(runs, "_carry_out_here", lambda flow, run: done.append(flow.name))
+
+    async def begin(client: Any, run: Any) -> None:
+        begun.append(run)
+
+    served._begin = begin
+
+    def unreadable(store: TrialStore) -> int:
+        raise error
+
+    with monkeypatch.context() as broken, ThreadPoolExecutor() as threads:
+        broken.setattr(runs, "last_number", unreadable)
+        asyncio.run(served._look(client, threads))
+    assert done == ["stop"]
+    assert begun == []
+    assert [run["flow"] for run in waiting(store)] == ["collect"]
+    client.runs.pop()
+    asyncio.run(served._look(client, None))
+    assert begun == client.runs
+
+
+def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
+    """The stop is read late: the server was lost. What had waited is cancelled by any clock."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
+    served, threads, begun = ServedRuns(store.folder, client.flows, {}), None, list[Any]()
+
+    async def begin(client: Any, run: Any) -> None:
+        begun.append(run)
+
+    async def supervise(client: Any) -> None:
+        pass
+
+    served._begin, served._supervise = begin, supervise
+    served._process, served._run = SimpleNamespace(returncode=None), client.runs[0]
+    (waited,) = client.runs
+    waited.created += timedelta(hours=1)  # the clock was set back
+    asyncio.run(served._look(client, threads))
+    early = client.due(waited.deployment_id)
+    control.ask(store, "stop", who="anna")
+    stop = datetime.fromisoformat(control.ask(store, "stop", who="ben").when)
+    between, later, unknown = (client.due(waited.deployment_id) for _ in range(3))
+    between.created = stop + timedelta(seconds=0.9)  # it is told to a second
+    later.created, unknown.created = stop + timedelta(seconds=1), None
+    client.runs += [early, between, later, unknown]
+    served._process = None
+    asyncio.run(served._look(client, threads))
+    assert client.said.keys() == {waited.id, early.id, between.id, unknown.id}
+    assert begun == [later]
+    assert control.stop_after(store, served._looked) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"host": "elsewhere"}, {"when": "noon"}, {"when": "2026-01-01T00:00:00"}]
+)
+def test_a_stop_whose_time_says_little_cancels_all(change: dict[str, str], tmp_path: Path) -> None:
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
+    served, threads = ServedRuns(store.folder, client.flows, {}), None
+    control.ask(store, "stop", who="anna")
+    path = store.folder / control.FOLDER / "000001.json"
+    write_json(path, {**read_json(path), **change})
+    client.runs[0].created += timedelta(hours=1)
+    asyncio.run(served._look(client, threads))
+    assert len(client.said) == 1
+
+
+def test_nothing_begins_while_a_stop_of_the_page_is_carried_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its request comes later: a process that begins now would find it, and end itself."""
+    store, client = TrialStore.create(tmp_path / "s"), Queue("collect", "stop")
+    rig, stop = ({run: flow} for run, flow in client.flows.items())
+    served, noted = ServedRuns(store.folder, rig, stop), threading.Event()
+
+    def carry_out(flow: Any, run: Any) -> None:
+        noted.wait(5)
+        control.ask(store, "stop", who="anna")
+
+    async def looks(threads: Any) -> None:
+        for _ in range(2):
+            await served._look(client, threads)
+        assert client.said == {}
+        noted.set()
+        await asyncio.wait(served._words.values())
+        client.runs.pop()
+        await served._look(client, threads)
+
+    monkeypatch.setattr(runs, "_carry_out_here", carry_out)
+    with ThreadPoolExecutor() as threads:
+        asyncio.run(looks(threads))
+    assert [said[:24] for said in client.said.values()] == ["CANCELLED: with the stop"]
 
 
 def test_a_stop_reaches_a_run_whose_process_starts(page: Page) -> None:
