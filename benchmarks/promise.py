@@ -29,7 +29,8 @@ def judged(seed: int, number: int, worlds: str) -> list[SceneEvidence]:
         evidence = feed(Papillae(), scene)
         some = evidence.value > 0.0
         told = Evidence.of(evidence.t_us[some], evidence.value[some])
-        found.append(SceneEvidence(told, scene.slip, scene.world))
+        world = f"{number}: {scene.world}"  # other sets have worlds of the same names
+        found.append(SceneEvidence(told, scene.slip, world))
     return found
 
 
