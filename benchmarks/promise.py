@@ -28,9 +28,9 @@ def judged(seed: int, number: int, worlds: str) -> list[SceneEvidence]:
         scene = simulated(drawn)
         evidence = feed(Papillae(), scene)
         some = evidence.value > 0.0
-        told = Evidence.of(evidence.t_us[some], evidence.value[some])
+        evidence = Evidence.of(evidence.t_us[some], evidence.value[some])
         world = f"{number}: {scene.world}"  # other sets have worlds of the same names
-        found.append(SceneEvidence(told, scene.slip, world))
+        found.append(SceneEvidence(evidence, scene.slip, world))
     return found
 
 

@@ -110,9 +110,9 @@ class LiveFolder:
             OSError: it cannot be written.
         """
         self.folder.mkdir(exist_ok=True)
-        beside = self.folder / f"{name}.new"
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, self.folder / name)
+        new = self.folder / f"{name}.new"
+        new.write_text(text, encoding="utf-8")
+        os.replace(new, self.folder / name)
 
 
 class LiveFeed:

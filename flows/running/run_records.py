@@ -33,7 +33,7 @@ from sliplab.storage.trials.store import TrialStore
 
 EMBEDDED = "embedded"
 NOTHING_TAKEN = "no trial was taken"
-"""In the message of a run whose window ended with nothing done: no fault, but nobody expects it."""
+"""In the message of a run whose window ended with nothing done: no fault, but unexpected."""
 _ID = r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"
 _BEGIN = re.compile(rf"{_ID}\.json")
 _OWED = re.compile(rf"({_ID})\.owed\.json")

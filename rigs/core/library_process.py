@@ -115,9 +115,9 @@ class PipeCalls:
     def close(self) -> None:
         """Close the pipe; safe to call more than once."""
         self._closed.set()
-        told = self._lock.acquire(timeout=STEP_S)  # or `tell` might write to what is opened next
+        locked = self._lock.acquire(timeout=STEP_S)  # or `tell` might write to what is opened next
         self.pipe.close()
-        if told:
+        if locked:
             self._lock.release()
 
     def end_late(self, stall: StallTimer) -> None:

@@ -178,11 +178,11 @@ class ServedRuns:
             if run.deployment_id in self._moving
         ]
         if self._moving and shown != self._shown:
-            told = {"process": this_process(), "runs": shown}
+            content = {"process": this_process(), "runs": shown}
             # of a full disk; the next look tries again
             with suppress(OSError, TimeoutError):
                 async with asyncio.timeout(DISK_S):
-                    await asyncio.to_thread(self._live.write, WAITING, json.dumps(told))
+                    await asyncio.to_thread(self._live.write, WAITING, json.dumps(content))
                     self._shown = shown
 
     async def _begin(self, client: Any, run: Any) -> None:

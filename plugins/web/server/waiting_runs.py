@@ -1,4 +1,4 @@
-"""Runs that wait for their turn or time: which may still begin, and which nobody expects any more.
+"""Runs that wait for their turn or time: which may still begin, and which are no longer expected.
 
 A run that waited moves the arm by itself, when the one before it ends or the service comes back.
 """

@@ -87,8 +87,8 @@ def test_stop_names_the_runs_that_it_ends(
     runs = [
         {"flow": flow, "due": "now", "begun": flow == "collect"} for flow in ("collect", "study")
     ]
-    told = {"process": this_process(), "runs": runs}
-    LiveFolder(store.folder).write(WAITING, json.dumps(told))  # by the service
+    content = {"process": this_process(), "runs": runs}
+    LiveFolder(store.folder).write(WAITING, json.dumps(content))  # by the service
     outcome = requests.stop_collection(store)
     assert outcome.holder is None
     named, queued = outcome.answer["did"]["waiting"]

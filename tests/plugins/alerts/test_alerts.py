@@ -182,7 +182,7 @@ def test_nothing_is_lost_while_a_receiver_is_down_and_nothing_is_told_twice(
     assert down.taken == []
     assert 5 <= down.tried <= 8  # ever less often
     down.up = True
-    again, _ = watcher(store, [up, down])  # the program began anew in the meantime
+    again, _ = watcher(store, [up, down])  # the program began restarted in the meantime
     for second in range(300, 900, 3):
         again.look(NOW + timedelta(seconds=second))
     assert up.taken == down.taken == ["collect crashed: killed"]
@@ -238,8 +238,8 @@ def test_a_full_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert receiver.taken == []
 
 
-@pytest.mark.parametrize("anew", [False, True], ids=["while it runs", "at its next start"])
-def test_a_clock_that_was_wrong_once_silences_nothing(tmp_path: Path, anew: bool) -> None:
+@pytest.mark.parametrize("restarted", [False, True], ids=["while it runs", "at its next start"])
+def test_a_clock_that_was_wrong_once_silences_nothing(tmp_path: Path, restarted: bool) -> None:
     store, receiver, down = TrialStore.create(tmp_path / "s"), Receiver(), Receiver("b", up=False)
     wrong = NOW + timedelta(days=1000)
     changes = {"most_per_hour": 1, "ping": "http://here"}
@@ -253,14 +253,14 @@ def test_a_clock_that_was_wrong_once_silences_nothing(tmp_path: Path, anew: bool
     pause(wrong)
     watching.look(wrong)
     assert (len(receiver.taken), len(pinged), down.tried) == (1, 1, 1)
-    if anew:
+    if restarted:
         watching, pinged = watcher(store, [receiver, down], NOW, **changes)
     down.up = True
     pause(NOW)
     watching.look(NOW)
     assert len(receiver.taken) == 2
     assert down.tried == 2
-    assert len(pinged) == (1 if anew else 2)
+    assert len(pinged) == (1 if restarted else 2)
     assert datetime.fromisoformat(read_json(store.folder / "alerts/began.json")["began"]) == NOW
 
 

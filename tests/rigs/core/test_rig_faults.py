@@ -284,6 +284,18 @@ def placed(rig: Rig, *way: Position) -> None:
             rig.clock.wait(0.01)
 
 
+def sent_to(rig: Rig) -> list[Position]:
+    """Note the places to which the arm is sent from now on."""
+    places, start = list[Position](), rig.arm.start
+
+    def noted(path: Any) -> None:
+        places.append(rig.plate_frame.position(path[0].to.xyz_mm))
+        start(path)
+
+    put(rig.arm, "start", noted)
+    return places
+
+
 def in_slide(rig: Rig) -> bool:
     place = rig.position()
     return place.depth_mm > 2.39 and place.x_mm > -2.0
@@ -343,15 +355,9 @@ def test_a_signal_that_is_passed_on_twice_does_not_prevent_the_way_out() -> None
 
 @pytest.mark.parametrize("begin", ["begin_trial", "press"])
 def test_an_arm_in_contact_leaves_the_plate_straight_out_first(begin: str) -> None:
-    rig, places = real(), []
+    rig = real()
     placed(rig, Position(-8.0, 0.0, -3.0), Position(-8.0, 0.0, 2.4))
-    start = rig.arm.start
-
-    def noted(path: Any) -> None:
-        places.append(rig.plate_frame.position(path[0].to.xyz_mm))
-        start(path)
-
-    put(rig.arm, "start", noted)
+    places = sent_to(rig)
     if begin == "begin_trial":
         rig.begin_trial(HOME, 1)
     else:
@@ -504,15 +510,9 @@ def test_whoever_stops_a_trial_is_told_of_the_plate_that_hangs() -> None:
 
 def test_a_small_clearance_is_not_clear() -> None:
     """The arm turns and slides only where the sensor cannot touch."""
-    rig, places = real(), list[Position]()
+    rig = real()
     placed(rig, Position(-8.0, 0.0, -3.0), Position(-8.0, 0.0, 1.0))
-    start = rig.arm.start
-
-    def noted(path: Any) -> None:
-        places.append(rig.plate_frame.position(path[0].to.xyz_mm))
-        start(path)
-
-    put(rig.arm, "start", noted)
+    places = sent_to(rig)
     rig.begin_trial(Position(0.0, 0.0, -0.05), 1)
     assert [round(place.depth_mm, 6) for place in places] == [-1.0, -0.05]
     assert [round(place.x_mm, 6) for place in places] == [-8.0, 0.0]

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -359,16 +360,23 @@ sys.stdin.read()
 """
 
 
-@pytest.mark.parametrize("whole", [False, True])
-def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> None:
-    """The control client stops it when its program dies; the watchdog when both die."""
-    robot = robot_of()
+@contextlib.contextmanager
+def driving(robot: Any) -> Iterator[Any]:
+    """Start a program that drives the arm; it prints the number of its control client."""
     arm_settings = ur_settings(robot.host).model_dump_json()
     program = subprocess.Popen(
         [sys.executable, "-c", DRIVES, arm_settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert program.stdin is not None
     with program.stdout, program.stdin:
+        yield program
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> None:
+    """The control client stops it when its program dies; the watchdog when both die."""
+    robot = robot_of()
+    with driving(robot) as program:
         client = int(program.stdout.readline())
         until(lambda: robot.pose().xyz_mm[1] > 2.0, 5.0)
         for pid in (client, program.pid)[not whole :]:
@@ -385,12 +393,7 @@ def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> 
 def test_the_arm_of_a_suspended_program_stops(robot_of: MakeRobot) -> None:
     """The control client lives on, and would keep the controller's watchdog content."""
     robot = robot_of()
-    arm_settings = ur_settings(robot.host).model_dump_json()
-    program = subprocess.Popen(
-        [sys.executable, "-c", DRIVES, arm_settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    assert program.stdin is not None
-    with program.stdout, program.stdin:
+    with driving(robot) as program:
         program.stdout.readline()
         until(lambda: robot.pose().xyz_mm[1] > 2.0, 5.0)
         try:

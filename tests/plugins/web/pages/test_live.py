@@ -91,8 +91,8 @@ def test_page_says_what_is_wrong_with_the_store(
 def test_runs_that_wait_for_their_turn_are_shown(store: TrialStore) -> None:
     due = "2026-11-21T22:00:00+00:00"
     runs = [{"flow": flow, "due": due, "begun": flow == "study"} for flow in ("study", "collect")]
-    told = {"process": this_process(), "runs": runs}
-    LiveFolder(store.folder).write(WAITING, json.dumps(told))
+    content = {"process": this_process(), "runs": runs}
+    LiveFolder(store.folder).write(WAITING, json.dumps(content))
     shown = Hub(Web(store, ACCESS))._tick(0.0)["status"]
     assert f'Waits for its turn</strong>: collect, due <time datetime="{due}">' in shown
     assert "Has begun, takes no trial now</strong>: study" in shown
