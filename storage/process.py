@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -174,6 +175,7 @@ def out_of_reach() -> Iterator[None]:
     They inherit the mask of blocked signals, so that none interrupts them before they have come to
     `leave_to_parent`. This process gets those that came meanwhile when the block ends.
     """
+    resource_tracker.ensure_running()  # which starts with the first child, and unblocks Ctrl-C
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_TERMINAL)
     try:
         yield

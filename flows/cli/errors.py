@@ -58,7 +58,7 @@ _WITH_TRIALS = {
 _ENDLESS = {
     "status": "interrupted: no longer watching",
     "alerts": "interrupted: no longer watching; what waits is sent when alerts run again",
-    "page": "interrupted: the page is closed; a collection that runs goes on",
+    "page": "interrupted: the page is closed",
     "detect": "interrupted: no longer detecting",
     "record": "interrupted: every committed trial is kept; of an unfinished one, the next "
     "recording or `sliplab verify` keeps what was written",

@@ -63,3 +63,23 @@ def test_children_begin_with_signals_of_the_terminal_blocked() -> None:
     said, _ = child.communicate(timeout=30)
     assert {signal.SIGINT, signal.SIGHUP} <= {int(number) for number in said.split()}
     assert not {signal.SIGINT, signal.SIGHUP} & signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+SEEN_BLOCKED = """
+import signal
+from sliplab.storage.process import out_of_reach
+from sliplab.storage.spawn_context import WORKERS
+with out_of_reach():
+    first = WORKERS.Process(target=len, args=((),))
+    first.start()
+    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+first.join()
+"""
+
+
+def test_the_first_child_is_out_of_reach_too() -> None:
+    """The tracker of multiprocessing, which starts with it, unblocks signals."""
+    done = subprocess.run(
+        [sys.executable, "-c", SEEN_BLOCKED], capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout.split() == ["True"], done.stderr
