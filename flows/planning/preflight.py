@@ -63,7 +63,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         PreflightCheck(
             "protocol and limits",
             True,
-            f"{plural(len(run_request.plan), 'trial')} within all limits",
+            f"{plural(len(run_request.plan), 'trial')} within `limits` of protocol and rig",
         ),
         PreflightCheck(
             "campaign", True, f"{len(pending)} of {len(run_request.plan)} still to collect"
