@@ -32,6 +32,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.build import ShouldStop, build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import DetectionTimes, Reaction, run_watched
+from sliplab.rigs.core.real_time import real_time
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
@@ -142,7 +143,7 @@ def detect(
         done.enter_context(_short_turns())
         if detector is None:
             centre_px = request.rig.calibration.centre_px
-            detector = done.enter_context(request.source.running(request.answer_s, centre_px))
+            detector = done.enter_context(request.source.running(request.own_process, centre_px))
         write = done.enter_context(_lines(out))
         done.enter_context(held(request.rig))
         done.enter_context(stopping.signals())
@@ -169,6 +170,8 @@ def detect(
         stepped = functools.partial(on_step, rig)
         sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say, stepped)
         rig.connect()
+        if request.real_time and (refused := done.enter_context(real_time())):
+            say(f"the system does not allow {refused}: other programs may delay the reflex")
         reaction, interrupted = None, False
         if request.trial is None:
             interrupted = _listen(request, rig, sink)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+from sliplab.rigs.core.real_time import real_time
 from sliplab.storage.streams import EventChunk
 
 START_S = 180.0
@@ -23,6 +25,19 @@ TRAIN_S = 3600.0
 """The same where it trains a detector first, s."""
 PATIENT_S = 30.0
 """Timeout of an answer in virtual time, where none is late, s."""
+
+
+@dataclass(frozen=True)
+class OwnProcess:
+    """How a separate process runs.
+
+    Attributes:
+        answer_s: timeout of an answer.
+        real_time: with real-time priority, where the system allows it.
+    """
+
+    answer_s: float
+    real_time: bool = False
 
 
 class NetworkLost(LibraryError):
@@ -34,16 +49,17 @@ class NetworkProcess:
 
     Args:
         model: its file.
-        answer_s: timeout of an answer.
+        run: how the process runs.
 
     Raises:
         NetworkLost: it does not start.
     """
 
-    def __init__(self, model: Path, answer_s: float) -> None:
-        self._answer_s = answer_s
+    def __init__(self, model: Path, run: OwnProcess) -> None:
+        self._answer_s = run.answer_s
+        arguments = str(model), run.real_time
         self._process = LibraryProcess(
-            "network's process", f"{__name__}:serve", (str(model),), START_S, NetworkLost
+            "network's process", f"{__name__}:serve", arguments, START_S, NetworkLost
         )
 
     def __call__(self, x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
@@ -70,7 +86,7 @@ class DetectorProcess(Detector):
 
     Args:
         name, level, store, promise: as `flows.detecting.sources.NamedSource`.
-        answer_s: timeout of an answer after the first one, for which kernels may be compiled.
+        run: how the process runs; the first answer takes longer where kernels are compiled.
 
     Raises:
         DetectorError: it does not start.
@@ -81,12 +97,11 @@ class DetectorProcess(Detector):
         name: str,
         level: float | None,
         store: Path | None,
-        promise: float | None = None,
-        *,
-        answer_s: float,
+        promise: float | None,
+        run: OwnProcess,
     ) -> None:
-        self._answer_s, self._warm = answer_s, False
-        arguments = name, level, None if store is None else str(store), promise
+        self._answer_s, self._warm = run.answer_s, False
+        arguments = name, level, None if store is None else str(store), promise, run.real_time
         with _as_detector_error():
             self._process = LibraryProcess(
                 "detector's process", f"{__name__}:serve_detector", arguments, TRAIN_S
@@ -121,7 +136,12 @@ def _as_detector_error() -> Iterator[None]:
 
 
 def serve_detector(
-    fd: int, name: str, level: float | None, store: str | None, promise: float | None
+    fd: int,
+    name: str,
+    level: float | None,
+    store: str | None,
+    promise: float | None,
+    first: bool,
 ) -> None:
     """Run the process: train the detector, then answer calls from the pipe on `fd`."""
     pipe = Connection(fd)
@@ -144,14 +164,14 @@ def serve_detector(
             "begin": detector.begin,
             "push": detector.push,
         }
-        _answer(pipe, lambda what, arguments: calls[what](*arguments))
+        _answer(pipe, lambda what, arguments: calls[what](*arguments), first)
         made.close()
     os._exit(0)
 
 
-def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any]) -> None:
-    """Answer calls until the pipe closes."""
-    with suppress(EOFError, OSError):
+def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any], first: bool) -> None:
+    """Answer calls until the pipe closes; `first`: with real-time priority."""
+    with real_time() if first else nullcontext(), suppress(EOFError, OSError):
         while True:
             what, arguments, _ = pipe.recv()
             answer: tuple[bool, Any]
@@ -162,7 +182,7 @@ def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any]) -> No
             pipe.send(answer)
 
 
-def serve(fd: int, model: str) -> None:
+def serve(fd: int, model: str, first: bool) -> None:
     """Run the process: answer windows from the pipe on `fd` until it closes."""
     pipe = Connection(fd)
     with suppress(EOFError, OSError):
@@ -180,5 +200,5 @@ def serve(fd: int, model: str) -> None:
             pipe.send((False, str(error)))
             os._exit(1)
         pipe.send((True, None))
-        _answer(pipe, lambda what, arguments: counting(*arguments))
+        _answer(pipe, lambda what, arguments: counting(*arguments), first)
     os._exit(0)

@@ -11,7 +11,7 @@ from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detectors import Tuned
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.training import Fitted
-from sliplab.flows.detecting.detector_process import PATIENT_S
+from sliplab.flows.detecting.detector_process import PATIENT_S, OwnProcess
 from sliplab.flows.detecting.sink import Timeouts
 from sliplab.flows.detecting.sources import NamedSource, NetworkSource, Source
 from sliplab.protocols import InputError, Plan, PlannedTrial, load_plan
@@ -56,12 +56,18 @@ class DetectRequest:
     set_by: Level | None = None
 
     @property
-    def answer_s(self) -> float | None:
-        """Timeout of an answer of the detector's own process; None: it runs in this one."""
+    def own_process(self) -> OwnProcess | None:
+        """The detector's own process; None: it runs in this one."""
         limit_ns = None if self.timeouts is None else self.timeouts.decision_ns
         if limit_ns is None:
             return None
-        return PATIENT_S if self.rig.in_virtual_time else limit_ns / 1e9
+        answer_s = PATIENT_S if self.rig.in_virtual_time else limit_ns / 1e9
+        return OwnProcess(answer_s, self.real_time)
+
+    @property
+    def real_time(self) -> bool:
+        """Whether a real reflex waits for what is computed."""
+        return self.reflex is not None and not self.rig.in_virtual_time
 
     @property
     def timeouts(self) -> Timeouts | None:

@@ -20,7 +20,7 @@ from sliplab.analysis.detectors.network_detector import Counting, NetworkDetecto
 from sliplab.analysis.detectors.registry import make_detector
 from sliplab.analysis.detectors.skin import SUFFIX, load_calibration
 from sliplab.analysis.networks.training import Fitted
-from sliplab.flows.detecting.detector_process import DetectorProcess, NetworkProcess
+from sliplab.flows.detecting.detector_process import DetectorProcess, NetworkProcess, OwnProcess
 from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import RigFile
@@ -71,20 +71,20 @@ class NetworkSource:
 
     @contextmanager
     def running(
-        self, answer_s: float | None, centre_px: tuple[float, float] | None
+        self, run: OwnProcess | None, centre_px: tuple[float, float] | None
     ) -> Iterator[StreamDetector]:
         """Yield the detector.
 
         Args:
-            answer_s: timeout of an answer of the network's own process; None: in this one.
+            run: the network in a process of its own; None: in this one.
 
         Raises:
             NetworkLost: the process does not start.
         """
-        if answer_s is None:
+        if run is None:
             yield self.detector(None, centre_px)
             return
-        with closing(NetworkProcess(self.model, answer_s)) as network:
+        with closing(NetworkProcess(self.model, run)) as network:
             yield self.detector(network, centre_px)
 
 
@@ -134,19 +134,19 @@ class NamedSource:
 
     @contextmanager
     def running(
-        self, answer_s: float | None, centre_px: tuple[float, float] | None
+        self, run: OwnProcess | None, centre_px: tuple[float, float] | None
     ) -> Iterator[StreamDetector]:
         """Yield the detector; see `NetworkSource.running`. It takes no centre of a crop.
 
         Raises:
             DetectorError: it cannot be trained, or its process does not start.
         """
-        if answer_s is None:
+        if run is None:
             with closing(self.detector()) as made:
                 yield made
             return
         given = self.name, self.level, self.store, self.promise
-        with closing(DetectorProcess(*given, answer_s=answer_s)) as process:
+        with closing(DetectorProcess(*given, run)) as process:
             yield AtLevel(process, process.level, process.set_by)
 
 

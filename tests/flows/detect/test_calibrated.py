@@ -12,7 +12,7 @@ from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.registry import contents, make_detector
 from sliplab.flows.detect import detect
-from sliplab.flows.detecting.detector_process import DetectorProcess
+from sliplab.flows.detecting.detector_process import DetectorProcess, OwnProcess
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.detecting.sources import named_source
 from sliplab.protocols import InputError
@@ -46,7 +46,7 @@ def test_live_evidence_is_the_stored_one_to_the_bit(
 @pytest.mark.long  # `test_named` has another detector in its process
 def test_in_its_process_it_has_the_level_of_the_document(document: Path) -> None:
     source = named_source(str(document), None, None)
-    process = DetectorProcess(source.name, source.level, None, answer_s=30.0)
+    process = DetectorProcess(source.name, source.level, None, None, OwnProcess(30.0))
     assert process.level == source.level
     process.close()
 

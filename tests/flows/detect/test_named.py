@@ -16,7 +16,7 @@ from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidenc
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.registry import make_detector
 from sliplab.flows.detect import detect
-from sliplab.flows.detecting.detector_process import DetectorProcess
+from sliplab.flows.detecting.detector_process import DetectorProcess, OwnProcess
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.detecting.sources import named_source
 from sliplab.protocols import InputError
@@ -115,7 +115,7 @@ def test_in_its_process_it_is_the_same_and_a_hang_ends_in_time() -> None:
     x, y = (rng.integers(0, side, 3000).astype(np.uint16) for side in (640, 480))
     given = EventChunk(x, y, rng.integers(0, 2, 3000).astype(np.uint8), t_us)
     scene = Scene("", given, 640, 480, 300_000, Slip(0, 0, 0))
-    process = DetectorProcess("flow", 2.5, None, answer_s=30.0)
+    process = DetectorProcess("flow", 2.5, None, None, OwnProcess(30.0))
     assert process.level == 2.5
     there, here_too = feed(process, scene), feed(make_detector("flow"), scene)
     np.testing.assert_array_equal(there.value, here_too.value)
@@ -133,7 +133,7 @@ def test_a_safe_state_has_it_in_a_process_of_its_own(protocol: Path, tmp_path: P
     order = make_detect_request(
         rig, None, protocol=protocol, trial="", detector=source, reflex="stop", hold_s=0.1
     )
-    assert order.answer_s is not None
+    assert order.own_process is not None
     assert detect(order)["reflex"]["done"]
 
 

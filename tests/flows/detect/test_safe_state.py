@@ -15,12 +15,13 @@ import pytest
 
 from sliplab.analysis.detectors.network_detector import Counting
 from sliplab.flows.detect import detect
-from sliplab.flows.detecting.detector_process import NetworkLost, NetworkProcess
+from sliplab.flows.detecting.detector_process import NetworkLost, NetworkProcess, OwnProcess
 from sliplab.flows.detecting.request import DetectRequest, make_detect_request
 from sliplab.protocols import InputError
 from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.reacting import SafeState
+from sliplab.rigs.core.real_time import real_time
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.storage.streams import EventChunk
@@ -155,7 +156,7 @@ def test_a_camera_that_fails_leads_to_the_safe_state(
 
 
 def test_a_dead_network_leads_to_the_safe_state(model: Path, gripping: Gripping) -> None:
-    network = NetworkProcess(model, 30.0)
+    network = NetworkProcess(model, OwnProcess(30.0))
     asked: list[int] = []
 
     def dying(x: np.ndarray) -> np.ndarray:
@@ -349,11 +350,15 @@ def test_the_network_in_its_process_is_the_network_and_a_hang_ends_in_time(model
     windows = untrained().windows
     shape = (1, windows.steps, windows.channels, windows.cells, windows.cells)
     x = np.random.default_rng(1).integers(0, 3, shape).astype(np.uint8)
-    network = NetworkProcess(model, 30.0)
+    network = NetworkProcess(model, OwnProcess(30.0, real_time=True))
     np.testing.assert_array_equal(network(x), counting_of(untrained())(x))
     with pytest.raises(NetworkLost):  # a window that is none: the process survives it
         network(x[:, :1, :, :3])
     network(x)
+    with real_time() as refused:
+        first = "rtprio" not in refused
+    policy = os.sched_getscheduler(network.pid) & ~os.SCHED_RESET_ON_FORK
+    assert policy == (os.SCHED_RR if first else os.SCHED_OTHER)
     network._answer_s = 0.5
     os.kill(network.pid, signal.SIGSTOP)
     with pytest.raises(NetworkLost, match=r"no answer within 0\.5 s"):
@@ -368,4 +373,4 @@ def test_a_model_that_is_none_does_not_start(tmp_path: Path) -> None:
     bad = tmp_path / "bad.pt"
     bad.write_text(json.dumps({}))
     with pytest.raises(NetworkLost, match="not a model file"):
-        NetworkProcess(bad, 1.0)
+        NetworkProcess(bad, OwnProcess(1.0))
