@@ -15,7 +15,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.program import Move
+from sliplab.protocols.program import Move, Position, Twist
 from sliplab.protocols.quantity import (
     PositiveMillimetres,
     PositiveNewtons,
@@ -25,6 +25,7 @@ from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.protocols.yaml_file import (
     StrictModel,
+    input_error,
     mask_secrets,
     parse_yaml,
     raise_all,
@@ -40,7 +41,13 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.rig_limits import RigLimits, check_depth_unit, check_zero
+from sliplab.rigs.rig_limits import (
+    Motion,
+    RigLimits,
+    check_arm,
+    check_depth_unit,
+    check_zero,
+)
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -543,30 +550,44 @@ def _plan_faults(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
                 f"the region of {plan.file} needs {frame_px[axis]} px",
             )
     over: set[str] = set()
-    for name, value, who in _extents(plan):
-        limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
-        if value > limit + 1e-9 and name not in over:
-            over.add(name)
-            text = f"{who[0]} needs {value:g} {unit} {who[1]}"
-            yield InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+    for motion in _motions(plan):
+        to = motion.to
+        reach_mm = (to.x_mm**2 + to.y_mm**2) ** 0.5
+        extents = {"depth": to.depth_mm, "speed": motion.speed_mm_s, "reach": reach_mm}
+        for name, value in extents.items():
+            limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
+            if value > limit + 1e-9 and name not in over:
+                over.add(name)
+                text = f"{motion.what} needs {value:g} {unit} {motion.where}"
+                yield InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+    if rig.devices is not None:
+        for fault in check_arm(rig.devices.arm.limits, rig.calibration, _motions(plan)):
+            yield input_error(file, fault)
 
 
-def _extents(plan: Plan) -> Iterator[tuple[str, float, tuple[str, str]]]:
-    """Yield every depth, speed and reach of a plan, and what needs it."""
+def _motions(plan: Plan) -> Iterator[Motion]:
+    """Yield every motion of a plan's conditions and of its maintenance."""
+    seen = set()
     for trial in plan:
-        for step in plan.program(trial).steps:
-            if isinstance(step, Move):
-                reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
-                who = f"trial {trial.id} of {plan.file}", f"in its phase '{step.phase}'"
-                yield "depth", step.to.depth_mm, who
-                yield "speed", step.speed_mm_s, who
-                yield "reach", reach, who
+        if trial.condition in seen:
+            continue
+        seen.add(trial.condition)
+        program, what = plan.program(trial), f"trial {trial.id} of {plan.file}"
+        at = program.home
+        yield Motion(at, at, 0.0, what, "where it begins")
+        for step in program.steps:
+            if isinstance(step, Move | Twist):
+                speed_mm_s = step.speed_mm_s if isinstance(step, Move) else 0.0
+                yield Motion(at, step.to, speed_mm_s, what, f"in its phase '{step.phase}'")
+                at = step.to
     upkeep = plan.protocol.collection.maintenance
-    if upkeep.warm_up is not None:
-        who = plan.file, "in collection.maintenance.warm_up"
-        yield "depth", float(upkeep.warm_up.depth), who
-        yield "speed", float(upkeep.warm_up.speed), who
-    if upkeep.rezero is not None:
-        who = plan.file, "in collection.maintenance.rezero"
-        yield "depth", float(upkeep.rezero.search), who
-        yield "speed", float(upkeep.rezero.speed), who
+    if (warm_up := upkeep.warm_up) is not None:
+        home, deep = (Position(0, 0, float(at)) for at in (-warm_up.clearance, warm_up.depth))
+        where = "in collection.maintenance.warm_up"
+        yield Motion(home, home, 0.0, plan.file, where)
+        yield Motion(home, deep, float(warm_up.speed), plan.file, where)
+    if (rezero := upkeep.rezero) is not None:
+        home, deep = (Position(0, 0, float(at)) for at in (-rezero.search, rezero.search))
+        where = "in collection.maintenance.rezero"
+        yield Motion(home, home, 0.0, plan.file, where, zeroed=False)
+        yield Motion(home, deep, float(rezero.speed), plan.file, where, zeroed=False)
