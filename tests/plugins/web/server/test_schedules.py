@@ -158,6 +158,28 @@ def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
     assert f"{tmp_path / 'mine.yaml'}: " in caught.value.message
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("pilot", ROOT / "protocols/pilot.yaml"),
+        ("pilot-gravity", ROOT / "protocols/pilot_gravity.yaml"),
+        ("reflex", "reflex"),  # a file beside the schedules comes first
+        ("gravity.yaml", None),
+    ],
+)
+def test_a_built_in_protocol_is_named_without_a_path(
+    name: str, found: Path | str | None, tmp_path: Path
+) -> None:
+    (tmp_path / "reflex").write_text((ROOT / "protocols/reflex.yaml").read_text())
+    path = write(tmp_path, {**NIGHT, "protocol": name})
+    if found is None:
+        with pytest.raises(InputError, match=r"protocol = gravity.yaml: no such file"):
+            load_schedules(path)
+    else:
+        (one,) = load_schedules(path)
+        assert one.parameters["protocol"] == str(tmp_path / found)
+
+
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: is used twice"):
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
