@@ -355,8 +355,7 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
     except InputError as error:
         unread = {each.key for each in found.data.faults}  # these name their file already
         raise InputError.joined(
-            each if each.key in unread else each.replaced(file=str(found.blame(each.key)))
-            for each in error.faults
+            each if each.key in unread else found.placed(each) for each in error.faults
         ) from None
 
 
