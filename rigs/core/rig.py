@@ -1153,7 +1153,8 @@ class Rig:
         return ArmFault(
             "arm",
             f"did not come clear of the plate: its way out was interrupted at a depth of "
-            f"{at.depth_mm:.2f} mm; look at it: the next trial begins with the way straight out",
+            f"{at.depth_mm:.2f} mm; look at it: the next trial begins with the way straight out; "
+            "every committed trial is kept",
         )
 
     def _retract(self, clear: Position, error: BaseException) -> RigError | None:
