@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
 from sliplab.rigs.core.touching import POLL_S, MarkerTouch, RateTouch
@@ -214,7 +214,7 @@ class _TouchDetector:
             raise RigError(
                 "frame camera",
                 f"sent no new image for {still_s:.1f} s while the sensor moves in it; the arm was "
-                "stopped: check the camera's trigger and cable, or use --by events",
+                f"stopped: check the camera's trigger and cable, or use --by events{OR_BUSY}",
             )
 
     def end(self) -> None:
