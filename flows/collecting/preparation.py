@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from sliplab.flows.running import console
 from sliplab.protocols import Plan, PlannedTrial, Task
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, TouchedZero
 from sliplab.rigs.core.touching import QUIET_S
+from sliplab.rigs.rig_file import RigFile
+
+
+def announce(rig: RigFile, step: str) -> None:
+    """Say what is being done where it takes real time: the bar moves after the first trial only."""
+    if not rig.in_virtual_time:
+        console.say(f"{step} ...")
 
 
 def ask(rig: Rig, task: Task) -> None:
