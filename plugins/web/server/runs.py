@@ -253,9 +253,12 @@ class ServedRuns:
 
 
 def _is_later(run: Any, stop: ControlRequest) -> bool:
-    """Return whether a run was surely created after a stop, whose time is told to a second."""
+    """Return whether a run was surely created after a stop; `when` is told to a second."""
     try:
-        after = datetime.fromisoformat(stop.when) + timedelta(seconds=1)
+        when = datetime.fromisoformat(stop.when)
+        after = latest = when + timedelta(seconds=1)
+        if stop.moment and when <= (moment := datetime.fromisoformat(stop.moment)) < latest:
+            after = moment
         return stop.host == socket.gethostname() and bool(run.created >= after)
     except (ValueError, TypeError):  # it is none, or has no zone
         return False

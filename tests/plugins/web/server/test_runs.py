@@ -324,7 +324,8 @@ def test_a_stop_of_the_page_does_not_wait_for_the_disk(
     assert begun == client.runs
 
 
-def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
+@pytest.mark.parametrize("moment", [True, False])
+def test_a_run_that_is_started_after_a_stop_is_begun(moment: bool, tmp_path: Path) -> None:
     """The stop is read late: the server was lost. What had waited is cancelled by any clock."""
     store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
     served, threads, begun = ServedRuns(store.folder, client.flows, {}), None, list[Any]()
@@ -342,10 +343,15 @@ def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
     asyncio.run(served._look(client, threads))
     early = client.due(waited.deployment_id)
     control.ask(store, "stop", who="anna")
-    stop = datetime.fromisoformat(control.ask(store, "stop", who="ben").when)
+    request = control.ask(store, "stop", who="ben")
+    stop = datetime.fromisoformat(request.moment)
+    if not moment:  # an older version's is told to a second
+        path = store.folder / control.FOLDER / "000002.json"
+        write_json(path, {**read_json(path), "moment": ""})
+        stop = datetime.fromisoformat(request.when) + timedelta(seconds=1)
     between, later, unknown = (client.due(waited.deployment_id) for _ in range(3))
-    between.created = stop + timedelta(seconds=0.9)  # it is told to a second
-    later.created, unknown.created = stop + timedelta(seconds=1), None
+    between.created = stop - timedelta(milliseconds=1)
+    later.created, unknown.created = stop + timedelta(milliseconds=1), None
     client.runs += [early, between, later, unknown]
     served._process = None
     asyncio.run(served._look(client, threads))
