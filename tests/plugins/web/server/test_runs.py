@@ -174,6 +174,11 @@ class Queue:
     async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
         return [run for run in self.runs if run.id not in self.said]
 
+    async def read_flow_run(self, run: UUID) -> Any:
+        from prefect.states import Running
+
+        return SimpleNamespace(state=Running())
+
     async def set_flow_run_state(self, run: UUID, state: Any) -> Any:
         self.said[run] = f"{state.type.value}: {state.message}"
         return SimpleNamespace(status=None)
@@ -317,6 +322,13 @@ def test_a_stop_of_the_page_does_not_wait_for_the_disk(
         broken.setattr(runs, "last_number", unreadable)
         asyncio.run(served._look(client, threads))
     assert done == ["stop"]
+    with monkeypatch.context() as broken, ThreadPoolExecutor() as threads:
+        broken.setattr(runs.run_records, "end_of", lambda store, run: unreadable(store))
+        served._process, served._run = SimpleNamespace(returncode=1), client.runs[0]
+        with pytest.raises(type(error)):  # the ended run cannot be closed
+            asyncio.run(served._look(client, threads))
+    assert done == ["stop", "stop"]
+    served._process = served._run = None
     assert begun == []
     assert [run["flow"] for run in waiting(store)] == ["collect"]
     client.runs.pop()
