@@ -234,6 +234,24 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path) -> None:
         collected(TrialStore.open(store), ["tiny"])
 
 
+@pytest.mark.parametrize("place", ["campaigns", "campaigns/new", "campaigns/a/trials/slide/new"])
+def test_no_store_is_made_among_the_campaigns_of_one(place: str, tmp_path: Path) -> None:
+    lab_hdf5(tmp_path / "slide.h5")
+    store, remote = tmp_path / "store", f"file://{tmp_path}/remote"
+    asked = ("import", tmp_path / "slide.h5", "--name", "a", "--store")
+    assert here(*asked, store).returncode == 0
+    assert here("push", store, remote).returncode == 0
+    before = sorted(tmp_path.rglob("*"))
+    for words in ((*asked, store / place), ("pull", remote, store / place)):
+        done = here(*words)
+        assert done.returncode == 2
+        told = " ".join(done.stderr.split())
+        assert (
+            "holds other files" in told or f"lies among the campaigns of the store {store}" in told
+        )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_exports_replace_no_original_and_nothing_of_a_store(tmp_path: Path) -> None:
     originals, store, out = tmp_path / "originals", tmp_path / "store", tmp_path / "out"
     originals.mkdir()
