@@ -261,8 +261,16 @@ class Scheduled(StrictModel):
         return self.name.replace(" ", "-")
 
     def end(self, begin: datetime) -> datetime | None:
-        """The end of the window of a run that is due at `begin`; None without one."""
+        """The end of the window of a run that is due at `begin`; None without one.
+
+        A run in an hour that a change of the clocks leaves out begins after it, and its window may
+        be over by then: it counts from the time that is written, as the run's own.
+        """
         until = self.parameters.get("until")
+        minute, hour, *_ = self.cron.split()
+        written = f"{hour:>02}:{minute:>02}"
+        if _UNTIL.fullmatch(written) and written != f"{begin:%H:%M}":
+            begin = begin.replace(hour=int(hour), minute=int(minute), fold=1).astimezone(UTC)
         return None if until is None else window_end(begin, until, self.timezone)
 
 

@@ -254,6 +254,25 @@ def test_no_run_begins_earlier_than_written(
     assert [str(time)[11:] for time in found] == begins
 
 
+@pytest.mark.parametrize(
+    ("begin", "until", "ends"),
+    [
+        ("02:30", "03:30", ["28 03:30:00+02:00", "29 03:30:00+02:00"]),  # the hour left out
+        ("02:30", "03:00", ["28 03:00:00+02:00", "29 03:00:00+02:00"]),
+        ("02:30", "06:00", ["28 06:00:00+02:00", "29 06:00:00+02:00"]),
+        ("03:30", "03:00", ["29 03:00:00+02:00", "30 03:00:00+02:00"]),  # a day less half an hour
+    ],
+)
+def test_a_window_that_begins_in_an_hour_left_out_ends_as_written(
+    begin: str, until: str, ends: list[str], tmp_path: Path
+) -> None:
+    days = {"name": "nights", "from": begin, "until": until, "days": list(DAYS)}
+    path = write(tmp_path, {**NIGHT, **days})
+    (item,) = load_schedules(path)
+    (found,) = upcoming_runs(path, [item], 2, datetime(2027, 3, 27, 12, tzinfo=UTC))
+    assert [str(item.end(time))[8:] for time in found] == ends
+
+
 def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
     off = {**weekly("0 3 * * *"), "active": False}
     words = ("serve", write(tmp_path, NIGHT, off), "--store", tmp_path / "store", "--rig", RIG)
