@@ -41,13 +41,7 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.rig_limits import (
-    Motion,
-    RigLimits,
-    check_arm,
-    check_depth_unit,
-    check_zero,
-)
+from sliplab.rigs.rig_limits import Motion, RigLimits, check_arm, check_depth_unit, check_zero
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -573,20 +567,20 @@ def _motions(plan: Plan) -> Iterator[Motion]:
         seen.add(trial.condition)
         program, what = plan.program(trial), f"trial {trial.id} of {plan.file}"
         at = program.home
-        yield Motion(at, at, 0.0, what, "where it begins")
+        yield Motion(at, what, "where it begins")
         for step in program.steps:
             if isinstance(step, Move | Twist):
                 speed_mm_s = step.speed_mm_s if isinstance(step, Move) else 0.0
-                yield Motion(at, step.to, speed_mm_s, what, f"in its phase '{step.phase}'")
-                at = step.to
+                turn_deg, at = abs(step.to.twist_deg - at.twist_deg), step.to
+                yield Motion(at, what, f"in its phase '{step.phase}'", speed_mm_s, turn_deg)
     upkeep = plan.protocol.collection.maintenance
     if (warm_up := upkeep.warm_up) is not None:
         home, deep = (Position(0, 0, float(at)) for at in (-warm_up.clearance, warm_up.depth))
         where = "in collection.maintenance.warm_up"
-        yield Motion(home, home, 0.0, plan.file, where)
-        yield Motion(home, deep, float(warm_up.speed), plan.file, where)
+        yield Motion(home, plan.file, where)
+        yield Motion(deep, plan.file, where, float(warm_up.speed))
     if (rezero := upkeep.rezero) is not None:
         home, deep = (Position(0, 0, float(at)) for at in (-rezero.search, rezero.search))
         where = "in collection.maintenance.rezero"
-        yield Motion(home, home, 0.0, plan.file, where, zeroed=False)
-        yield Motion(home, deep, float(rezero.speed), plan.file, where, zeroed=False)
+        yield Motion(home, plan.file, where, zeroed=False)
+        yield Motion(deep, plan.file, where, float(rezero.speed), zeroed=False)

@@ -36,11 +36,11 @@ class Motion:
         zeroed: depths count from depth zero, not from the taught plane.
     """
 
-    begin: Position
     to: Position
-    speed_mm_s: float
     what: str
     where: str
+    speed_mm_s: float = 0.0
+    turn_deg: float = 0.0
     zeroed: bool = True
 
 
@@ -69,13 +69,7 @@ def check_arm(
         found = [
             ("depth_mm", at.depth_mm, "mm beyond the taught plane", limits.depth_mm, 1),
             ("speed_mm_s", motion.speed_mm_s, "mm/s", limits.speed_mm_s, 1),
-            (
-                "tilt_deg",
-                abs(motion.to.twist_deg - motion.begin.twist_deg),
-                "deg",
-                limits.tilt_deg,
-                1,
-            ),
+            ("tilt_deg", motion.turn_deg, "deg", limits.tilt_deg, 1),
         ]
         for axis, value, low, high in zip("xyz", xyz, limits.low_mm, limits.high_mm, strict=True):
             unit = f"mm in {axis} of the {limits.frame} frame"
