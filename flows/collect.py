@@ -12,6 +12,7 @@ import time
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from sliplab.flows.collecting.preparation import announce
 from sliplab.flows.collecting.progress import progress_display
 from sliplab.flows.collecting.requests import (
     carry_out,
@@ -74,6 +75,7 @@ def collect_flow(request: RunRequest) -> CollectResult:
         collector, trials = session.collector, session.trials
         # inside a flow Prefect has installed its own handlers
         with progress.begin(trials), stopping.signals():
+            announce(request.rig, "connecting sync box, arm and sensors")
             collector.rig.connect()
             begun = 0
             while trials:

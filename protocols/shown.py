@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from datetime import date
 from decimal import Decimal
 from functools import lru_cache
+from itertools import pairwise
 
 MASK = "****"
 
@@ -25,6 +26,12 @@ _WORDS = re.compile(r"[A-Z]?[a-z0-9]+|[A-Z0-9]+")
 _ENDS = ("key", "keys", "token", "tokens", "secret", "secrets", "credential", "credentials")
 _PARTS = ("passw", "passphrase", "secret")
 _WHOLE = frozenset({"pass", "pwd", "pw", "auth"})
+_ALIKE = frozenset({"key", "keys", "token", "tokens"})
+"""Words of secrets that are also words of a lab: a key that is gripped, a token that is lifted."""
+_OWN = frozenset({"factors", "context", "condition", "streams"})
+"""Sections whose keys are names that a user gives."""
+_TRIAL = re.compile(r"(?:[\w-]+=[^,\s=]+,)+r=\d+(?![\w=])")
+"""A trial's id: levels by factor."""
 _MISSPELT = ("password", "passwd", "passphrase", "secret", "token", "credentials")
 _CLOSE = 0.85
 _WRITTEN = re.compile(r"(?<![\w-])([\w-]+)\s*[:=]\s*(?=[^\s*])")
@@ -47,13 +54,31 @@ def _is_secret_word(word: str) -> bool:
     return bool(difflib.get_close_matches(word, _MISSPELT, n=1, cutoff=_CLOSE))
 
 
-def holds_secret(key: str) -> bool:
+def is_own_name(section: str, name: str) -> bool:
+    """Return whether a key below a section is a user's name of something: no secret's."""
+    words = [word.lower() for word in _WORDS.findall(name[:_LOOKED_AT])]
+    return section in _OWN and not any(
+        _is_secret_word(word) for word in words if word not in _ALIKE
+    )
+
+
+def holds_secret(key: str, *, of_mapping: bool = False) -> bool:
     """Return whether a part of a key's path (``devices.arm.password``) is a secret's name.
 
-    A section that is called ``key`` is not a secret: a user's own name, such as of a factor.
+    A section that is called ``key`` is not a secret, nor is a name that a user gives to a factor or
+    a stream, or the level of such a factor.
+
+    Args:
+        of_mapping: the key's value is a section of its own.
     """
-    *sections, last = re.findall(r"[^.\[\]]+", key) or [""]
-    return is_secret(last) or any(is_secret(name) for name in sections if name != "key")
+    names = ["", *re.findall(r"[^.\[\]]+", key)]
+    for number, (section, name) in enumerate(pairwise(names), 2):
+        inside = number < len(names)
+        if (inside and name == "key") or not is_secret(name):
+            continue
+        if not (is_own_name(section, name) and (inside or of_mapping or section == "condition")):
+            return True
+    return False
 
 
 def password_in(url: str) -> str | None:
@@ -128,12 +153,14 @@ def _escaped(character: str) -> str:
 def _yaml(value: object, key: str) -> str:
     if value is None:
         return "null"
-    if holds_secret(key):
+    if holds_secret(key, of_mapping=isinstance(value, dict)):
         return MASK
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
-        pairs = ", ".join(f"{shown_key(str(k))}: {_yaml(v, str(k))}" for k, v in value.items())
+        pairs = ", ".join(
+            f"{shown_key(str(k))}: {_yaml(v, f'{key}.{k}')}" for k, v in value.items()
+        )
         return f"{{{pairs}}}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_yaml(part, "") for part in value) + "]"
@@ -145,7 +172,9 @@ def _yaml(value: object, key: str) -> str:
 
 
 def _without_secret(text: str) -> str:
+    ids = [found.span() for found in _TRIAL.finditer(text[:_LOOKED_AT])]
     for found in _WRITTEN.finditer(text[:_LOOKED_AT]):
-        if is_secret(found[1]):
+        level = any(begin <= found.start() < end for begin, end in ids)
+        if is_secret(found[1]) and not (level and is_own_name("condition", found[1])):
             return without_passwords(text[: found.end()]) + MASK
     return without_passwords(text)

@@ -42,6 +42,7 @@ from sliplab.protocols.shown import (
     MASK,
     did_you_mean,
     holds_secret,
+    is_own_name,
     is_secret,
 )
 
@@ -451,9 +452,10 @@ def parse_leniently(text: str, path: str | Path) -> YamlDocument:
     return YamlDocument(data, builder.written, builder.faults)
 
 
-def _withheld(key: str) -> bool:
+def _withheld(section: str, key: str, of_mapping: bool) -> bool:
     """Return whether a key's value stays out of copies: a secret, or addresses with secrets."""
-    return is_secret(key) or key == "alerts"
+    own = of_mapping and is_own_name(section, key)
+    return (is_secret(key) and not own) or key == "alerts"
 
 
 def mask_secrets(text: str) -> str:
@@ -466,22 +468,27 @@ def mask_secrets(text: str) -> str:
     return text
 
 
-def _secret_values(node: Any) -> Iterator[Any]:
+def _secret_values(node: Any, section: str = "") -> Iterator[Any]:
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     for key, value in pairs:
-        if isinstance(key.value, str) and _withheld(key.value):
+        name = key.value if isinstance(key.value, str) else ""
+        if _withheld(section, name, isinstance(value, yaml.MappingNode)):
             if value.value not in ("", MASK):
                 yield value
         else:
-            yield from _secret_values(value)
+            yield from _secret_values(value, name)
     for item in node.value if isinstance(node, yaml.SequenceNode) else []:
         yield from _secret_values(item)
 
 
-def without_secrets(data: Any) -> Any:
+def without_secrets(data: Any, section: str = "") -> Any:
     """Plain data without the keys that hold secrets, at any depth."""
     if isinstance(data, dict):
-        return {key: without_secrets(part) for key, part in data.items() if not _withheld(key)}
+        return {
+            key: without_secrets(part, key)
+            for key, part in data.items()
+            if not _withheld(section, key, isinstance(part, dict))
+        }
     return [without_secrets(part) for part in data] if isinstance(data, list) else data
 
 

@@ -15,7 +15,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_text
 from sliplab.protocols.key_errors import NAME_PATTERN, KeyedError
 from sliplab.protocols.plan import Plan
-from sliplab.protocols.program import Move
+from sliplab.protocols.program import Move, Position, Twist
 from sliplab.protocols.quantity import (
     PositiveMillimetres,
     PositiveNewtons,
@@ -25,6 +25,7 @@ from sliplab.protocols.shown import MASK, is_secret
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.protocols.yaml_file import (
     StrictModel,
+    input_error,
     mask_secrets,
     parse_yaml,
     raise_all,
@@ -40,7 +41,7 @@ from sliplab.rigs.core.registry import find_driver
 from sliplab.rigs.core.sections import RigSection, SimulatedRig
 from sliplab.rigs.device_section import DeviceSettings, Simulated
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.rigs.rig_limits import RigLimits, check_depth_unit, check_zero
+from sliplab.rigs.rig_limits import Motion, RigLimits, check_arm, check_depth_unit, check_zero
 from sliplab.rigs.stream_settings import (
     FrameStream,
     Streams,
@@ -348,8 +349,7 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
     except InputError as error:
         unread = {each.key for each in found.data.faults}  # these name their file already
         raise InputError.joined(
-            each if each.key in unread else each.replaced(file=str(found.blame(each.key)))
-            for each in error.faults
+            each if each.key in unread else found.placed(each) for each in error.faults
         ) from None
 
 
@@ -543,30 +543,44 @@ def _plan_faults(rig: RigFile, plan: Plan, file: str) -> Iterator[InputError]:
                 f"the region of {plan.file} needs {frame_px[axis]} px",
             )
     over: set[str] = set()
-    for name, value, who in _extents(plan):
-        limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
-        if value > limit + 1e-9 and name not in over:
-            over.add(name)
-            text = f"{who[0]} needs {value:g} {unit} {who[1]}"
-            yield InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+    for motion in _motions(plan):
+        to = motion.to
+        reach_mm = (to.x_mm**2 + to.y_mm**2) ** 0.5
+        extents = {"depth": to.depth_mm, "speed": motion.speed_mm_s, "reach": reach_mm}
+        for name, value in extents.items():
+            limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
+            if value > limit + 1e-9 and name not in over:
+                over.add(name)
+                text = f"{motion.what} needs {value:g} {unit} {motion.where}"
+                yield InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)
+    if rig.devices is not None:
+        for fault in check_arm(rig.devices.arm.limits, rig.calibration, _motions(plan)):
+            yield input_error(file, fault)
 
 
-def _extents(plan: Plan) -> Iterator[tuple[str, float, tuple[str, str]]]:
-    """Yield every depth, speed and reach of a plan, and what needs it."""
+def _motions(plan: Plan) -> Iterator[Motion]:
+    """Yield every motion of a plan's conditions and of its maintenance."""
+    seen = set()
     for trial in plan:
-        for step in plan.program(trial).steps:
-            if isinstance(step, Move):
-                reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
-                who = f"trial {trial.id} of {plan.file}", f"in its phase '{step.phase}'"
-                yield "depth", step.to.depth_mm, who
-                yield "speed", step.speed_mm_s, who
-                yield "reach", reach, who
+        if trial.condition in seen:
+            continue
+        seen.add(trial.condition)
+        program, what = plan.program(trial), f"trial {trial.id} of {plan.file}"
+        at = program.home
+        yield Motion(at, what, "where it begins")
+        for step in program.steps:
+            if isinstance(step, Move | Twist):
+                speed_mm_s = step.speed_mm_s if isinstance(step, Move) else 0.0
+                turn_deg, at = abs(step.to.twist_deg - at.twist_deg), step.to
+                yield Motion(at, what, f"in its phase '{step.phase}'", speed_mm_s, turn_deg)
     upkeep = plan.protocol.collection.maintenance
-    if upkeep.warm_up is not None:
-        who = plan.file, "in collection.maintenance.warm_up"
-        yield "depth", float(upkeep.warm_up.depth), who
-        yield "speed", float(upkeep.warm_up.speed), who
-    if upkeep.rezero is not None:
-        who = plan.file, "in collection.maintenance.rezero"
-        yield "depth", float(upkeep.rezero.search), who
-        yield "speed", float(upkeep.rezero.speed), who
+    if (warm_up := upkeep.warm_up) is not None:
+        home, deep = (Position(0, 0, float(at)) for at in (-warm_up.clearance, warm_up.depth))
+        where = "in collection.maintenance.warm_up"
+        yield Motion(home, plan.file, where)
+        yield Motion(deep, plan.file, where, float(warm_up.speed))
+    if (rezero := upkeep.rezero) is not None:
+        home, deep = (Position(0, 0, float(at)) for at in (-rezero.search, rezero.search))
+        where = "in collection.maintenance.rezero"
+        yield Motion(home, plan.file, where, zeroed=False)
+        yield Motion(deep, plan.file, where, float(rezero.speed), zeroed=False)

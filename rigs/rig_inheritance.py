@@ -38,9 +38,23 @@ class RigSource:
 
     def blame(self, key: str) -> Path:
         """Return the file that sets `key`, the first one where none does."""
-        path = re.findall(r"[^.\[\]]+", key)
+        path = _path(key)
         deepest = max(_depth(data, path) for _, data in self.parts)
         return next(file for file, data in self.parts if _depth(data, path) == deepest)
+
+    def placed(self, fault: InputError) -> InputError:
+        """Return a fault with its file: the one that was written last of the keys that it names."""
+        files, blamed = [file for file, _ in self.parts], self.blame(fault.key)
+        for name in re.findall(r"(\w[\w.]*) = ", fault.expected):
+            for key in (name, f"{fault.key.rpartition('.')[0]}.{name}"):
+                file, path = self.blame(key), _path(key)
+                if _depth(self.data, path) == len(path) and files.index(file) < files.index(blamed):
+                    value: Any = self.data
+                    for part in path:
+                        value = value[part]
+                    text = f"contradicts {blamed}: {fault.key} = {fault.value}: {fault.expected}"
+                    return InputError(file, key, value, text)
+        return fault.replaced(file=str(blamed))
 
 
 def shipped_rigs() -> dict[str, Path]:
@@ -137,6 +151,11 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         else:
             merged[key] = value
     return merged
+
+
+def _path(key: str) -> list[str]:
+    """Return the parts of a key."""
+    return re.findall(r"[^.\[\]]+", key)
 
 
 def _depth(data: Any, path: list[str]) -> int:

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from sliplab.flows.running import console
 from sliplab.protocols import Plan, PlannedTrial, Task
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, TouchedZero
+from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig
+from sliplab.rigs.core.surface_search import TouchedZero, rezero, touch_off
 from sliplab.rigs.core.touching import QUIET_S
+from sliplab.rigs.rig_file import RigFile
+
+
+def announce(rig: RigFile, step: str) -> None:
+    """Say what is being done where it takes real time: the bar moves after the first trial only."""
+    if not rig.in_virtual_time:
+        console.say(f"{step} ...")
 
 
 def ask(rig: Rig, task: Task) -> None:
@@ -47,13 +56,13 @@ def warm_up(rig: Rig, plan: Plan, trial: PlannedTrial) -> None:
         RigError: the touch or a press failed.
     """
     collection = plan.protocol.collection
-    asked, rezero = collection.maintenance.warm_up, collection.maintenance.rezero
+    asked, touching = collection.maintenance.warm_up, collection.maintenance.rezero
     if asked is None:
         return
-    if rezero is not None and rig.event_camera is not None:
+    if touching is not None and rig.event_camera is not None:
         # a seed of its own: the touches of `find_zero`, and the trials, stay what they were
         seed = hash_integer(collection.seed, "before warm-up", plan.rezero_task(trial).slot)
-        rig.touch_off(float(rezero.speed), float(rezero.search), seed)
+        touch_off(rig, float(touching.speed), float(touching.search), seed)
     rig.press(float(asked.depth), float(asked.speed), float(asked.clearance), asked.presses)
 
 
@@ -65,16 +74,16 @@ def preparation_seconds(rig: Rig, plan: Plan, *, warm: bool, zeroed: bool) -> fl
         zeroed: depth zero is found.
     """
     upkeep = plan.protocol.collection.maintenance
-    pressed, rezero = None if warm else upkeep.warm_up, upkeep.rezero
+    pressed, touching = None if warm else upkeep.warm_up, upkeep.rezero
     out_mm_s = rig.at_most(RETRACT_SPEED_MM_S)
     seconds = 0.0
     if pressed is not None:
         way_mm = float(pressed.depth + pressed.clearance)
         seconds += pressed.presses * way_mm * (1 / float(pressed.speed) + 1 / out_mm_s)
-    if rezero is not None and rig.event_camera is not None:
-        touches = (0 if zeroed else rezero.touches) + (pressed is not None)
-        way_mm = 2 * float(rezero.search)  # from as far before the plane to as far beyond it
-        seconds += touches * (QUIET_S + way_mm * (1 / float(rezero.speed) + 1 / out_mm_s))
+    if touching is not None and rig.event_camera is not None:
+        touches = (0 if zeroed else touching.touches) + (pressed is not None)
+        way_mm = 2 * float(touching.search)  # from as far before the plane to as far beyond it
+        seconds += touches * (QUIET_S + way_mm * (1 / float(touching.speed) + 1 / out_mm_s))
     return seconds
 
 
@@ -88,4 +97,4 @@ def find_zero(rig: Rig, plan: Plan, trial: PlannedTrial) -> TouchedZero | None:
     if collection.maintenance.rezero is None:
         return None
     seed = hash_integer(collection.seed, "rezero", plan.rezero_task(trial).slot)
-    return rig.rezero(collection.maintenance.rezero, seed)
+    return rezero(rig, collection.maintenance.rezero, seed)

@@ -22,6 +22,7 @@ from typing import Protocol
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.live_feed import LiveFeed
 from sliplab.flows.collecting.preparation import (
+    announce,
     ask,
     change_over,
     find_zero,
@@ -37,6 +38,7 @@ from sliplab.protocols import Plan, PlannedTrial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.program import ACTING, Step
+from sliplab.protocols.shown import plural
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import FORCE, Rig, StopRequested, TrialRun, ignore_step
@@ -131,6 +133,9 @@ def open_session(
         ):
             # a motion has no planned end that is certain, so the window ends whatever runs, but for
             # a plate that hangs on the sensor: the way out would drop it
+            kind = "starting the fakes of" if run_request.rig.simulated else "opening"
+            count = plural(sum(1 for _ in run_request.rig.drivers()), "device")
+            announce(run_request.rig, f"{kind} {count}")
             rig = build_rig(
                 run_request.rig,
                 lambda: (
@@ -344,11 +349,15 @@ class TrialCollector:
         self._check_window(trial)  # a person may have taken hours
         maintenance = self.plan.protocol.collection.maintenance
         if maintenance.warm_up is not None and not self._warm:
+            touches = maintenance.rezero is not None and self.rig.event_camera is not None
+            step = "warming up the skin"
+            announce(self.rig_file, f"touching off, {step}" if touches else step)
             warm_up(self.rig, self.plan, trial)
             self._warm = True
         if maintenance.rezero is not None and self.rig.event_camera is not None:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
+                announce(self.rig_file, "touching off: depth zero")
                 zero = find_zero(self.rig, self.plan, trial)
                 self._zero_slot, self._zero_sd_mm = slot, None if zero is None else zero.sd_mm
         self._check_window(trial)

@@ -26,12 +26,14 @@ def alerts(
     as_json: JsonOption = False,
 ) -> None:
     """Tell people by mail or chat when a run fails, a pause lasts, or a campaign is done."""
+    from contextlib import ExitStack
     from datetime import datetime
 
     from sliplab.flows.running import stopping
     from sliplab.plugins.alerts.settings import load_alerts
     from sliplab.plugins.alerts.targets import AppriseTarget, Target
     from sliplab.plugins.alerts.watcher import POLL_S, AlertWatcher
+    from sliplab.storage.errors import disk_fault
     from sliplab.storage.trials.lock import exclusive
     from sliplab.storage.trials.store import TrialStore
 
@@ -50,7 +52,14 @@ def alerts(
         if not all(taken.values()):
             raise typer.Exit(exit_codes.FAILED)
         return
-    with exclusive(opened.folder / LOCK, f"alerts of {opened.folder}"):
+    with ExitStack() as held:
+        try:
+            held.enter_context(exclusive(opened.folder / LOCK, f"alerts of {opened.folder}"))
+        except OSError as error:
+            if (fault := disk_fault(error)) is None:
+                raise
+            text = "alerts go out without a lock, and twice if another program sends them"
+            console.say(f"the disk of {opened.folder} {fault}: {text}")
         now = datetime.now().astimezone()
         watcher = AlertWatcher(opened, settings, targets, now, console.say)
         console.say(f"watching {opened.folder}; Ctrl-C ends")

@@ -25,7 +25,7 @@ from sliplab.plugins.ati_net_ft import rdt
 from sliplab.plugins.ati_net_ft.settings import FILTER_NUMBERS, AtiNetFtSettings
 from sliplab.protocols.timing import ForceGrade
 from sliplab.rigs.core.capabilities import DeviceHealth, Mounting, RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.rigs.core.network import BoundedSocket
 from sliplab.storage.streams import Json, WrenchChunk
 
@@ -361,7 +361,7 @@ class AtiNetFt:
             "trial again"
             if self._rejected
             else f"nothing came for {silence_s:g} s; check its power and its cable, and that no "
-            "other program reads it"
+            f"other program reads it{OR_BUSY}"
         )
 
     def _take(self, data: bytes, host_ns: int, last: int | None) -> int | None:

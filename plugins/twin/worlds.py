@@ -30,6 +30,7 @@ from sliplab.plugins.twin.posterior import Bank
 from sliplab.plugins.twin.statistics import VERSION, SlideStatistics, of_names, statistics
 from sliplab.protocols import Plan, PlannedTrial
 from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.surface_search import touch_off
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import F64
 from sliplab.storage.trials.derived import Derived, make_key
@@ -134,7 +135,7 @@ def touch_depth_mm(rig: RigFile) -> float:
         made.connect()
         surface = devices.world.plane.pose(0.0, 0.0, 0.0).xyz_mm
         taught = made.plate_frame.with_zero(0.0).position(surface).depth_mm
-        found = [made.touch_off(TOUCH_MM_S, TOUCH_SEARCH_MM, seed) for seed in range(TOUCHES)]
+        found = [touch_off(made, TOUCH_MM_S, TOUCH_SEARCH_MM, seed) for seed in range(TOUCHES)]
     finally:
         made.close()
     # by noise the mean may come before the surface; no skin is noticed there

@@ -17,6 +17,7 @@ import numpy as np
 from sliplab.plugins.uvc.capture import NewFrames
 from sliplab.plugins.uvc.settings import UvcSettings
 from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
+from sliplab.rigs.core.host_clock import OR_BUSY
 from sliplab.rigs.core.library_process import LibraryProcess, of_device
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
@@ -172,7 +173,7 @@ class UvcCamera:
         if taken.silent_s <= limit_s:
             return None
         what = "no frame" if taken.received else "no frame since the start,"
-        return f"{what} for {taken.silent_s:.1f} s; check its cable"
+        return f"{what} for {taken.silent_s:.1f} s; check its cable{OR_BUSY}"
 
     def read_clock(self) -> ClockReads:
         """Not possible. Raises RigError."""

@@ -52,7 +52,8 @@ class ArmLimits(StrictModel):
     def _makes_sense(self) -> ArmLimits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
-                raise KeyedError(".low_mm", list(self.low_mm), f"{axis} is not below high_mm")
+                text = f"{axis} is not below high_mm = {list(self.high_mm)}"
+                raise KeyedError(".low_mm", list(self.low_mm), text)
         return self
 
 

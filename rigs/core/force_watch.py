@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.program import Move, Position, Step, Twist, step_seconds
 from sliplab.rigs.core.capabilities import ForceSensor, Pose, RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.storage.streams import WrenchChunk
@@ -134,7 +134,7 @@ class ForceWatch:
             silent_s = self._stall.waited_s((self._fresh_ns,))
             if silent_s > self._silent_s:
                 why = "no sample came" if self._fresh_ns is None else "no newer sample came"
-                raise _unusable(f"{why} for {silent_s:.2f} s")
+                raise _unusable(f"{why} for {silent_s:.2f} s", OR_BUSY)
         return chunk
 
     def follow(self, pose: Pose, depth_mm: float) -> None:
@@ -257,8 +257,8 @@ class ForceWatch:
         self._normal_n = np.concatenate([self._normal_n, normal_n])[retained]
 
 
-def _unusable(text: str) -> RigError:
-    return RigError(DEVICE, f"{text}; the arm was stopped: check the sensor and its cable")
+def _unusable(text: str, cause: str = "") -> RigError:
+    return RigError(DEVICE, f"{text}; the arm was stopped: check the sensor and its cable{cause}")
 
 
 @dataclass

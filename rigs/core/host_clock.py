@@ -9,6 +9,9 @@ import threading
 import time
 from collections.abc import Callable
 
+OR_BUSY = "; or this computer is too busy"
+"""Other cause of data that do not come: the two cannot be told apart."""
+
 
 class HostClock:
     """The host's monotonic clock, which gives the arrival times of data; a `Clock`."""

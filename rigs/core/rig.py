@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.maintenance import MAX_CREEP_MM_S, Rezero
 from sliplab.protocols.motion import UNTWIST_DEG_S
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.program import (
@@ -71,12 +69,11 @@ from sliplab.rigs.core.motion_watch import (
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg, distance_mm
 from sliplab.rigs.core.pulse_code import SEEDS
-from sliplab.rigs.core.touching import POLL_S, QUIET_S, NoiseWatch, RateTouch, count_central
+from sliplab.rigs.core.touching import POLL_S, NoiseWatch
 from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
-    EventChunk,
     ExposureChunk,
     Json,
     PathSegment,
@@ -95,7 +92,7 @@ FINGERS_MM = 0.01
 FINGERS_POLL_S = 0.002
 FORCE = "force"
 """Name of the force sensor's stream."""
-_MOVE_GRACE_S = 10.0
+MOVE_GRACE_S = 10.0
 _POSE_SETTLE_S = 0.5
 """Longest time for the pose to show the end of a path that was reported as finished."""
 _TURN_DEG = 1.0
@@ -131,15 +128,6 @@ class TrialRun:
         """Start and end of the recorded steps on the arm's clock."""
         recorded = [step for step, is_recorded in self.steps if is_recorded]
         return recorded[0].start_ns, recorded[-1].end_ns
-
-
-@dataclass(frozen=True)
-class TouchedZero:
-    """Depth zero as the mean of some touches, and the standard deviation of single ones, mm."""
-
-    mm: float
-    sd_mm: float | None
-    """None of a single touch."""
 
 
 def ignore_step(step: Step) -> None:
@@ -206,7 +194,7 @@ class Rig:
     """When the moving arm was looked at last."""
     _sent: bool = field(default=False, init=False)
     """A motion was sent, and the arm was not seen at rest since."""
-    _noise: NoiseWatch | None = field(default=None, init=False)
+    noise: NoiseWatch | None = field(default=None, init=False)
     """The event camera's noise while the arm approaches the plate."""
     _zeroed: bool = field(default=False, init=False)
     """The present load was taken for zero since the sensor was connected."""
@@ -507,56 +495,6 @@ class Rig:
                 self.move(Move("warm up", deep, speed_mm_s), home, None)
                 self.move(Move("warm up", home, out_mm_s), deep, None)
 
-    def rezero(self, asked: Rezero, seed: int) -> TouchedZero:
-        """Find depth zero as a protocol asks for: the mean of several touches.
-
-        Args:
-            seed: of the first touch on a simulated rig; the others have their own.
-
-        Returns:
-            The new depth zero, which the plate's frame uses from now on.
-
-        Raises:
-            RigError: as `touch_off`; one touch without a plate is enough.
-        """
-        speed, search = float(asked.speed), float(asked.search)
-        seeds = (seed, *(hash_integer(seed, "touch", n) for n in range(1, asked.touches)))
-        found = np.array([self.touch_off(speed, search, each) for each in seeds])
-        zero = float(found.mean())
-        self.plate_frame = self.plate_frame.with_zero(zero)
-        return TouchedZero(zero, float(found.std(ddof=1)) if len(found) > 1 else None)
-
-    def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
-        """Find depth zero: creep in until the event rate shows that the centre papilla touches.
-
-        See `rigs.core.touching.RateTouch`. A touch is detected only after some indentation:
-        `touch_mm` of the rig's calibration.
-
-        Args:
-            search_mm: hard limit beyond the taught plane.
-
-        Returns:
-            The new depth zero in the taught frame, mm; the frame uses it from now on.
-
-        Raises:
-            RigError: no touch was detected within `search_mm`.
-        """
-        if not speed_mm_s <= MAX_CREEP_MM_S:
-            raise RigError(
-                "arm", f"touches off at {MAX_CREEP_MM_S:g} mm/s at most, not {speed_mm_s:g}"
-            )
-        self.plate_frame = self.plate_frame.with_zero(0.0)
-        start = Position(0.0, 0.0, -search_mm)
-        with self.safely(start):
-            self.begin_trial(start, seed)
-            self.events.start()
-            zero = self._approach_until_touch(search_mm, speed_mm_s, self.measure_noise())
-            self.events.stop()
-            out_mm_s = self.at_most(RETRACT_SPEED_MM_S)
-            self.move(Move("release", start, out_mm_s), self.position(), None)
-        self.plate_frame = self.plate_frame.with_zero(zero)
-        return zero
-
     def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
         """Record events, poses and pulses to `sink` without moving anything.
 
@@ -582,61 +520,6 @@ class Rig:
                 self._stop_arm()  # it is not moved by this program
                 raise
             self.stop_streams(sink)
-
-    def _approach_until_touch(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
-        target = Position(0.0, 0.0, search_mm)
-        seconds = _seconds(2 * search_mm, speed_mm_s)
-        with self.moving(Segment(self.plate_frame.pose(target), speed_mm_s)):
-            deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
-            while not self.arm.progress().done:
-                if self.clock.now_ns() > deadline:
-                    raise ArmFault("arm", "did not finish touching off in time")
-                self.wait(POLL_S)
-                depth = self.position().depth_mm
-                if rate.touched(self.central_events(), depth, self.clock.now_ns()):
-                    self.arm.stop()
-                    break
-            else:
-                state = self.arm.state()
-                if not state.healthy:  # the arm was stopped; the taught plane may still be right
-                    raise arm_fault(state, "touching off")
-        self.rests_here(speed_mm_s)
-        surface = rate.surface_mm(speed_mm_s)
-        if surface is not None and abs(surface - self.touch_mm) <= search_mm:
-            return surface - self.touch_mm
-        raise RigError(
-            "arm",
-            f"touching off found no plate within {search_mm:g} mm of the taught plane; "
-            "teach the contact plane again",
-        )
-
-    def measure_noise(self) -> RateTouch:
-        """Measure the event camera's noise at rest for `QUIET_S`, to detect a touch by it.
-
-        Raises:
-            RigError: a real camera sent no event at all.
-        """
-        self._noise = None
-        self.wait(QUIET_S)
-        chunk = self.events.read()
-        self._noise = NoiseWatch(
-            chunk, self.clock.now_ns, may_be_silent=self.simulation is not None
-        )
-        return RateTouch(self._count_central(chunk))
-
-    def central_events(self) -> int:
-        """Read the events; return their number around the centre papilla.
-
-        Raises:
-            RigError: no more events came, not even noise.
-        """
-        chunk = self.events.read()
-        if self._noise is not None:
-            self._noise.check(chunk)
-        return self._count_central(chunk)
-
-    def _count_central(self, chunk: EventChunk) -> int:
-        return count_central(chunk, (self.events.width, self.events.height), self.centre_px)
 
     def take_step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
         """Carry out one step of a program from `at`, the arm's position; call it inside `safely`.
@@ -693,7 +576,7 @@ class Rig:
             StopRequested: as `wait`; the arm is still moving then, and `safely` stops it.
             ArmFault: the arm stopped, or did not finish in time.
         """
-        seconds = _seconds(at.distance_mm(step.to), step.speed_mm_s)
+        seconds = path_seconds(at.distance_mm(step.to), step.speed_mm_s)
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         return self._follow(segment, seconds, step.phase, sink)[:2]
 
@@ -719,7 +602,7 @@ class Rig:
         def left_s() -> float:
             return forces.seconds_to(force_n, self.clock.now_ns()) - goes_on_s
 
-        seconds = _seconds(at.distance_mm(step.to), step.speed_mm_s)
+        seconds = path_seconds(at.distance_mm(step.to), step.speed_mm_s)
         segment = Segment(self.plate_frame.pose(step.to), step.speed_mm_s)
         start, end, stopped = self._follow(segment, seconds, step.phase, None, left_s)
         forces.needed = self.force_limit_n is not None
@@ -733,7 +616,7 @@ class Rig:
 
     def twist(self, step: Twist, at: Position, sink: Sink | None = None) -> tuple[int, int]:
         """Turn about the plate's normal on the spot; as `move`."""
-        seconds = _seconds(abs(step.to.twist_deg - at.twist_deg), step.speed_deg_s)
+        seconds = path_seconds(abs(step.to.twist_deg - at.twist_deg), step.speed_deg_s)
         bound_mm_s = self.at_most(RETRACT_SPEED_MM_S)
         segment = Segment(self.plate_frame.pose(step.to), bound_mm_s, step.speed_deg_s)
         return self._follow(segment, seconds, step.phase, sink)[:2]
@@ -764,7 +647,7 @@ class Rig:
                 self._check_end(segment, phase, sink)
             return start, start, False
         with self.moving(segment, leaving=leaving):
-            deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
+            deadline = self.clock.now_ns() + int((2 * seconds + MOVE_GRACE_S) * 1e9)
             while not (progress := self.arm.progress()).done:
                 if not progress.state.healthy:
                     raise arm_fault(progress.state, phase)
@@ -1153,7 +1036,8 @@ class Rig:
         return ArmFault(
             "arm",
             f"did not come clear of the plate: its way out was interrupted at a depth of "
-            f"{at.depth_mm:.2f} mm; look at it: the next trial begins with the way straight out",
+            f"{at.depth_mm:.2f} mm; look at it: the next trial begins with the way straight out; "
+            "every committed trial is kept",
         )
 
     def _retract(self, clear: Position, error: BaseException) -> RigError | None:
@@ -1221,7 +1105,7 @@ def _close_quietly(device: Any) -> None:
         device.close()
 
 
-def _seconds(way: float, speed: float) -> float:
+def path_seconds(way: float, speed: float) -> float:
     """Return the time that a path takes; infinite at an invalid speed, which is never sent."""
     if way == 0.0:
         return 0.0

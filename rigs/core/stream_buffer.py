@@ -11,7 +11,7 @@ import threading
 from typing import Any
 
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.storage.streams import I64
 
 MOST_PARTS = 100_000
@@ -116,4 +116,4 @@ class StreamBuffer:
         self._check_fault()
         silent_s = self._stall.waited_s(self._count) if self._running else 0.0
         if silent_s > self._stall_s:
-            raise RigError(self._device, f"silent for {silent_s:.1f} s; look at its cable")
+            raise RigError(self._device, f"silent for {silent_s:.1f} s; look at its cable{OR_BUSY}")

@@ -17,9 +17,10 @@ import numpy.typing as npt
 from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.program import Move, Position
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
+from sliplab.rigs.core.surface_search import central_events, measure_noise
 from sliplab.rigs.core.touching import POLL_S, MarkerTouch, RateTouch
 from sliplab.storage.streams import FrameChunk
 
@@ -116,7 +117,7 @@ def touch(
         rig.begin_clear(seed)
         # on any failure `safely` stops the streams, after the arm
         _start(rig, seed, find is not None)
-        rate = rig.measure_noise()
+        rate = measure_noise(rig)
         _approach(rig, across, clear, rate)
         detector = _TouchDetector(rig, creep, rate, find)
         _creep(rig, clear, deepest, detector)
@@ -154,7 +155,7 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
             if rig.clock.now_ns() > deadline:
                 raise ArmFault("arm", "did not finish its approach to the plate in time")
             rig.wait(_APPROACH_POLL_S)
-            if rig.central_events() > rate.limit:
+            if central_events(rig) > rate.limit:
                 rig.arm.stop()
                 depth = rig.position().depth_mm
                 raise RigError(
@@ -189,7 +190,7 @@ class _TouchDetector:
         rig = self._rig
         depth = rig.position().depth_mm
         self.deepest_mm = max(self.deepest_mm, depth)
-        touched = self._rate.touched(rig.central_events(), depth, rig.clock.now_ns())
+        touched = self._rate.touched(central_events(rig), depth, rig.clock.now_ns())
         if touched and self._by_events_mm is None:
             self._look_back()
             self._limit_mm = min(self._limit_mm, depth + self._creep.after_mm)
@@ -214,7 +215,7 @@ class _TouchDetector:
             raise RigError(
                 "frame camera",
                 f"sent no new image for {still_s:.1f} s while the sensor moves in it; the arm was "
-                "stopped: check the camera's trigger and cable, or use --by events",
+                f"stopped: check the camera's trigger and cable, or use --by events{OR_BUSY}",
             )
 
     def end(self) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy import special
 
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.storage.streams import EventChunk
 
 F64 = npt.NDArray[np.float64]
@@ -87,7 +87,7 @@ class NoiseWatch:
             raise RigError(
                 "event camera",
                 f"sent no newer event for {silent_s:.2f} s, not even noise, so a touch would not "
-                "show; the arm was stopped: check its cable",
+                f"show; the arm was stopped: check its cable{OR_BUSY}",
             )
 
 

@@ -11,8 +11,8 @@ import pandas as pd
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import make_folder, replacing, sync_folder, write_json
-from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST
+from sliplab.storage.files import make_folder, replacing, sweep_marked, sync_folder, write_json
+from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST, EXPORT_UNFINISHED
 from sliplab.storage.formats.known import known_format
 from sliplab.storage.formats.recognition import read_manifest
 from sliplab.storage.schema.label import LABELS
@@ -45,14 +45,17 @@ def export_trials(
     """
     how = known_format(kind)
     assert how.export is not None
-    earlier = read_manifest(folder) or {"trials": (), "simulated": False}
-    ours = {item["file"]: item for item in earlier["trials"]}
+    earlier = read_manifest(folder) or {}
+    ours = {item["file"]: item for item in earlier.get("trials", ())}
+    begun = set(earlier.get(EXPORT_UNFINISHED, ()))  # by an export that was killed
     paths = [folder / f"{recording.trial_id}{how.suffixes[0]}" for recording in recordings]
     for path in paths:
-        if path.name not in ours and os.path.lexists(path):  # perhaps the only original
+        if path.name not in {*ours, *begun} and os.path.lexists(path):  # maybe the only original
             text = f"is not in {EXPORT_MANIFEST} and is not replaced; name a new folder"
             raise InputError("--output", "", str(path), text)
     make_folder(folder)
+    if begun:
+        sweep_marked(folder)
     about: Json = {
         "sliplab_export": EXPORT_FORMAT,
         "campaign": campaign,
@@ -62,6 +65,9 @@ def export_trials(
     if stream != EVENTS_KIND:
         about["stream"] = stream
     listed: list[Json] = []
+    begun |= {path.name for path in paths}
+    unfinished = {EXPORT_UNFINISHED: sorted(begun)}
+    write_json(folder / EXPORT_MANIFEST, about | {"trials": []} | earlier | unfinished)
     try:
         for recording, path in zip(recordings, paths, strict=True):
             on_trial(recording.trial_id)
@@ -74,11 +80,13 @@ def export_trials(
                 raise InputError("--as", "", kind, f"trial {recording.trial_id} {error}") from None
             listed.append(_listed(recording, path.name, counts))
     except BaseException:
-        if listed:  # the next export may replace what is there by now
-            about["simulated"] |= earlier["simulated"]
-            about["trials"] = [*(ours | {item["file"]: item for item in listed}).values()]
-            with suppress(OSError):
-                write_json(folder / EXPORT_MANIFEST, about)
+        with suppress(OSError):
+            if listed:  # the next export may replace what is there by now
+                about["simulated"] |= earlier.get("simulated", False)
+                about["trials"] = [*(ours | {item["file"]: item for item in listed}).values()]
+                write_json(folder / EXPORT_MANIFEST, about | unfinished)
+            elif not earlier:
+                (folder / EXPORT_MANIFEST).unlink()
         raise
     sync_folder(folder)
     write_json(folder / EXPORT_MANIFEST, about | {"trials": listed})

@@ -38,6 +38,8 @@ ChunkT = TypeVar("ChunkT", bound=EventChunk | FrameChunk | PoseChunk | WrenchChu
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
 EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
+EXPORT_UNFINISHED = "unfinished"
+"""Key of the manifest: files that an export may have written that has not ended."""
 """File next to exported trials, from which they are imported again unchanged."""
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14

@@ -24,6 +24,7 @@ from sliplab.storage.formats.by_time import by_time
 from sliplab.storage.formats.foreign import (
     EXPORT_FORMAT,
     EXPORT_MANIFEST,
+    EXPORT_UNFINISHED,
     Damage,
     ForeignTrial,
     FormatError,
@@ -447,6 +448,8 @@ def read_manifest(folder: Path) -> Json | None:
             raise ValueError(f"{path}: sliplab_export must be {EXPORT_FORMAT}")
         if not isinstance(found.get("simulated"), bool):
             raise ValueError(f"{path}: simulated must be true or false")
+        for name in found.get(EXPORT_UNFINISHED, ()):
+            safe_name(name)
         for item in found["trials"]:
             safe_name(item["trial"])
             safe_name(item["file"])

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -34,9 +35,11 @@ class ControlRequest(Entry):
 
     Attributes:
         campaign: campaign of the trials; empty where the whole store is meant.
+        moment: `when` to a microsecond; empty in stores of older versions.
     """
 
     kind: Kind
+    moment: str = ""
     campaign: str = ""
     trials: tuple[str, ...] = ()
 
@@ -65,6 +68,7 @@ def ask(
         OSError: it cannot be written.
     """
     content: Json = {"kind": kind, "campaign": campaign, "trials": trials, **signature(who, why)}
+    content["moment"] = datetime.now(UTC).isoformat()
     number = _journal(store).append(content)
     return ControlRequest(number=number, **content)
 
@@ -78,6 +82,7 @@ def requests(store: TrialStore) -> list[ControlRequest]:
             made = ControlRequest(
                 number=number,
                 kind=data["kind"],
+                moment=str(data.get("moment", "")),
                 who=str(data["who"]),
                 when=str(data["when"]),
                 why=str(data.get("why", "")),

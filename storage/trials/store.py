@@ -453,7 +453,7 @@ class TrialStore:
         """Return whether a folder holds a store; False for one that could hold one.
 
         Raises:
-            NoStore: it is a URL, a file, or a folder that holds something else.
+            NoStore: it is a URL, a file, a folder that holds something else, or among campaigns.
         """
         refuse_url(folder)
         if (folder / STORE).exists():
@@ -462,6 +462,10 @@ class TrialStore:
             raise NoStore(folder, "is a file; give a folder for the store")
         if folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir()):
             raise NoStore(folder, "holds other files; give an empty folder or a store")
+        for place in (there := folder.resolve()).parents:
+            if there.is_relative_to(place / "campaigns") and (place / STORE).is_file():
+                text = f"lies among the campaigns of the store {place}; give a folder outside of it"
+                raise NoStore(folder, text)
         return False
 
     @staticmethod
@@ -470,7 +474,7 @@ class TrialStore:
         """Open the store in `folder`; make it if there is none.
 
         Raises:
-            NoStore: the folder holds something else.
+            NoStore: as `exists`.
             StoreError: nothing can be written there.
         """
         if not TrialStore.exists(folder):

@@ -19,6 +19,7 @@ from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, without_secret
 from sliplab.rigs.core.registry import listed, load_driver
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
+from tests.protocols.planning import rows
 
 NAMES = """password passwrd pasword passord paswrd Passwort pass pwd passphrase secret secrt token
 client_secret tokn api_key apiKey key auth credentials AWS_SECRET_ACCESS_KEY"""
@@ -137,6 +138,39 @@ def test_sections_called_key_hold_no_secret() -> None:
     assert error.message == "adapter.yaml: factors.key.field = 7: must be text"
     assert MASK in InputError("rig.yaml", "devices.arm.key", "hunter2", "is unknown").message
     assert MASK in InputError("rig.yaml", "devices.auth.user", "hunter2", "is unknown").message
+
+
+SHOWN = """
+    collection.factors.grip_key.values[0] | 99 mm | 99 mm
+    collection.context.wear_token.levels[1] | soft | soft
+    collection.references.condition.grip_key | 2.4 mm | 2.4 mm
+    streams.house_keys.device.port | 5 | 5
+    collection.factors | {grip_key: {unit: mm}} | {grip_key: {unit: mm}}
+    trial | grip_key=2.8mm,wear_token=soft,r=1 | grip_key=2.8mm,wear_token=soft,r=1
+    collection.factors.grip_key | hunter2 | ****
+    streams.api_key | hunter2 | ****
+    streams.client_secret.port | hunter2 | ****
+    streams.house_keys.token | hunter2 | ****
+    streams | {api_key: hunter2} | {api_key: ****}
+    devices.arm.grip_key | 99 mm | ****
+    trial | password=hunter2,r=1 | password=****
+    trial | api_key=hunter2, r=1 | api_key=****
+"""
+
+
+@pytest.mark.parametrize(("key", "value", "text"), rows(SHOWN))
+def test_a_name_that_a_user_gives_is_no_secrets(key: str, value: str, text: str) -> None:
+    read = parse_yaml(f"a: {value}", "a.yaml")["a"]
+    assert shown(read, key) == text
+    if "=" in value:
+        assert shown_key(f"trials.{value}") == f"trials.{text}"
+
+
+def test_a_stream_that_is_named_like_a_secret_is_copied_without_its_secrets() -> None:
+    text = "streams: {house_keys: {port: 5, token: 12345}, api_key: hunter2}\n"
+    masked = text.replace("12345", f'"{MASK}"').replace("hunter2", f'"{MASK}"')
+    assert mask_secrets(text) == masked
+    assert without_secrets(parse_yaml(text, "rig.yaml")) == {"streams": {"house_keys": {"port": 5}}}
 
 
 def test_plural_of_one_has_no_ending() -> None:

@@ -1,11 +1,13 @@
 """Rig files are checked as carefully as protocols."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError, load_plan
 from sliplab.rigs.rig_file import check_plan, load_rig_file, same_rig
 from tests.conftest import ROOT
@@ -93,6 +95,38 @@ def test_a_plan_beyond_the_rig_is_refused(old: str, new: str, says: str, tmp_pat
     path = written(tmp_path / "rig.yaml", MOCK.replace(old, new))
     with pytest.raises(InputError, match=says):
         check_plan(load_rig_file(path)[0], load_plan(Path("pilot")), str(path))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("depth_mm", 3.2, "= 3.2: trial depth=3.4mm,.*pilot.yaml needs 3.4 mm .*phase 'press'"),
+        ("high_mm", [4, 20, 3.8], "trial .* needs 4.5 mm in x of the plate frame"),
+        ("low_mm", [-20, -20, -4], "trial .* needs -5 mm in z of the plate frame where it begins"),
+        ("speed_mm_s", 9, "= 9.0: trial .* needs 20 mm/s in its phase 'approach'"),
+        ("frame", "base", "needs 395 mm in x of the base frame where it begins"),
+        (
+            "plate",
+            {"centre_mm": [0, 0, 0], "right_mm": [9, 0, 0], "above_mm": [8, 0, 0]},
+            "one line",
+        ),
+    ],
+)
+def test_a_plan_beyond_the_arms_own_limits_is_refused(
+    key: str, value: Any, says: str, tmp_path: Path
+) -> None:
+    data = yaml.safe_load((ROOT / "rigs" / "ur5.yaml").read_text())
+    data["devices"]["arm"]["limits"][key] = value
+    path = written(tmp_path / "rig.yaml", data)
+    with pytest.raises(InputError) as caught:
+        make_request(Path("pilot"), path, tmp_path / "store")
+    assert re.search(f"rig.yaml: devices.arm.limits.*{says}", caught.value.message)
+
+
+def test_a_turn_beyond_the_arms_own_limit_is_refused() -> None:
+    says = r"limits.tilt_deg = 30.0: trial angle=-40deg,.* needs 40 deg in its phase 'twist'"
+    with pytest.raises(InputError, match=says):
+        check_plan(load_rig_file(Path("ur5"))[0], load_plan(Path("press_twist")), "ur5")
 
 
 @pytest.mark.parametrize(("name", "driver"), [("mock", "mock"), ("ur5", "devices")])

@@ -107,6 +107,11 @@ FAULTS = f"""
     limits: {{depth: 3 mm}} | {SPEED} | mock.yaml | limits.speed | mm/s
     frame_camera: {{scale_px_per_mm: 12}} | | child.yaml | frame_camera.scale_px_per_mm \
 | must be mock.frame_camera.px_per_mm = 20
+    limits: {{depth: 0.2 mm}} | | child.yaml | limits.depth | limits.depth = 0.2 mm: contradicts
+    timing: {{sync_box: {{drift_ppm: 5}}}} | | child.yaml | timing.sync_box.drift_ppm \
+| mock.yaml: mock.clocks.sync_box_ppm = 10.0: must be at most timing.sync_box.drift_ppm = 5
+    mock: {{clocks: {{read_longest_us: 1}}}} | mock: {{seed: 1, clocks: {{read_shortest_us: 9}}}} \
+| child.yaml | mock.clocks.read_longest_us | must be at least read_shortest_us = 9
     calibration: {{contact_plane: {{centre: [a, 0 mm, 0 mm]}}}} | | child.yaml \
 | calibration.contact_plane.centre[0] | number with a unit
 """

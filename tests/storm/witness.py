@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.flows.collecting import preparation
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.planning.disk_space import RESERVE
 from sliplab.plugins.simulation.arm import MockArm
@@ -159,7 +160,7 @@ class Witness:
         """Watch every arm of this process."""
         start, pass_time = MockArm.start, SimulatedWorld.pass_time
         run_trial: Any = Rig.run_trial
-        rezero: Any = Rig.rezero
+        rezero: Any = preparation.rezero
         take_step: Any = Rig.take_step
         start_streams: Any = Rig.start_streams
         stop_streams: Any = Rig.stop_streams
@@ -269,7 +270,7 @@ class Witness:
         put(Rig, "_retract", retracting)
         put(SimulatedWorld, "pass_time", passing)
         put(Rig, "run_trial", running)
-        put(Rig, "rezero", rezeroing)
+        put(preparation, "rezero", rezeroing)
         put(Rig, "start_streams", starting_streams)
         put(Rig, "stop_streams", stopping_streams)
         put(Rig, "take_step", stepping)

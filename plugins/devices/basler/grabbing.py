@@ -18,7 +18,7 @@ from typing import Any
 from sliplab.plugins.devices.basler.frame_time import FrameStamping
 from sliplab.plugins.devices.basler.nodes import DEVICE
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.storage.streams import U8
 
 POLL_MS = 100
@@ -171,7 +171,7 @@ class Grab:
                 return RigError(
                     DEVICE,
                     f"{what} for {silent_ns / 1e9:.1f} s{but}; check its cable, its power and its "
-                    "trigger",
+                    f"trigger{OR_BUSY}",
                 )
             return None
 

@@ -20,7 +20,7 @@ from sliplab.plugins.devices.dvxplorer.process import EventProcess
 from sliplab.plugins.devices.dvxplorer.settings import DvxplorerSettings
 from sliplab.plugins.devices.dvxplorer.source import DEVICE, EventBatch
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
-from sliplab.rigs.core.host_clock import StallTimer
+from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
@@ -213,7 +213,8 @@ class DvxplorerCamera:
             raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:
             raise RigError(
-                DEVICE, f"sent no event and no pulse for {silent_s:.1f} s; check cable and lens"
+                DEVICE,
+                f"sent no event and no pulse for {silent_s:.1f} s; check cable and lens{OR_BUSY}",
             )
 
     def _want(self, wanted: bool) -> None:

@@ -105,17 +105,10 @@ class ServedRuns:
 
     async def _look(self, client: Any, threads: ThreadPoolExecutor) -> None:
         """Check the run on the rig, and start due runs."""
-        if self._process is not None:
-            await self._supervise(client)
-        if self._asked is not None and self._process is None:
-            run = await client.read_flow_run(self._asked.id)
-            self._asked = None
-            if run.state.is_pending():
-                await self._start(run)
         self._words = {run: word for run, word in self._words.items() if not word.done()}
         self._stops = [stop for stop in self._stops if not stop.done()]
         due = await self._due(client)
-        for run in due:  # first: a stop must not wait for the store's disk
+        for run in due:  # first: a stop must wait neither for the store's disk nor for other runs
             if run.deployment_id in self._control and run.id not in self._words:
                 flow, context = self._control[run.deployment_id], contextvars.copy_context()
                 self._words[run.id] = asyncio.get_running_loop().run_in_executor(
@@ -123,6 +116,13 @@ class ServedRuns:
                 )
                 if flow.name == "stop":
                     self._stops.append(self._words[run.id])
+        if self._process is not None:
+            await self._supervise(client)
+        if self._asked is not None and self._process is None:
+            run = await client.read_flow_run(self._asked.id)
+            self._asked = None
+            if run.state.is_pending():
+                await self._start(run)
         due = [run for run in due if run.deployment_id in self._on_rig]
         held = bool(self._stops)  # one that is not among the store's requests yet
         try:
@@ -234,13 +234,19 @@ class ServedRuns:
 
         assert self._process is not None
         run = str(self._run.id)
-        if (retained := run_records.end_of(self._store, run)) is not None:
+        async with asyncio.timeout(DISK_S):
+            retained = await asyncio.to_thread(run_records.end_of, self._store, run)
+        if retained is not None:
             state: Any = State(type=StateType(retained["state"]), message=retained["message"])
         elif cancelled:
             state = Cancelled(message="stopped before it started")
         else:
             state = Crashed(message=f"its process was killed ({self._process.returncode})")
         await client.set_flow_run_state(self._run.id, state, force=True)
+        async with asyncio.timeout(DISK_S):
+            await asyncio.to_thread(self._record_end, run, state)
+
+    def _record_end(self, run: str, state: Any) -> None:
         run_records.end(self._store, run, state.type.value, state.message, "service")
         run_records.delivered(self._store, run)
 
@@ -253,9 +259,12 @@ class ServedRuns:
 
 
 def _is_later(run: Any, stop: ControlRequest) -> bool:
-    """Return whether a run was surely created after a stop, whose time is told to a second."""
+    """Return whether a run was surely created after a stop; `when` is told to a second."""
     try:
-        after = datetime.fromisoformat(stop.when) + timedelta(seconds=1)
+        when = datetime.fromisoformat(stop.when)
+        after = latest = when + timedelta(seconds=1)
+        if stop.moment and when <= (moment := datetime.fromisoformat(stop.moment)) < latest:
+            after = moment
         return stop.host == socket.gethostname() and bool(run.created >= after)
     except (ValueError, TypeError):  # it is none, or has no zone
         return False

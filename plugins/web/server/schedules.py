@@ -17,6 +17,7 @@ computer was off, must not take the rest of its night out of the next day.
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -36,6 +37,7 @@ from sliplab.flows.planning.parameters import (
 )
 from sliplab.protocols import InputError
 from sliplab.protocols.key_errors import KeyedError
+from sliplab.protocols.shipped import shipped_protocols
 from sliplab.protocols.shown import one_of
 from sliplab.protocols.yaml_file import (
     StrictModel,
@@ -259,8 +261,16 @@ class Scheduled(StrictModel):
         return self.name.replace(" ", "-")
 
     def end(self, begin: datetime) -> datetime | None:
-        """The end of the window of a run that is due at `begin`; None without one."""
+        """The end of the window of a run that is due at `begin`; None without one.
+
+        A run in an hour that a change of the clocks leaves out begins after it, and its window may
+        be over by then: it counts from the time that is written, as the run's own.
+        """
         until = self.parameters.get("until")
+        minute, hour, *_ = self.cron.split()
+        written = f"{hour:>02}:{minute:>02}"
+        if _UNTIL.fullmatch(written) and written != f"{begin:%H:%M}":
+            begin = begin.replace(hour=int(hour), minute=int(minute), fold=1).astimezone(UTC)
         return None if until is None else window_end(begin, until, self.timezone)
 
 
@@ -453,6 +463,8 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
     from sliplab.protocols import load_plan
 
     found = (path.parent / name).resolve()
+    if not os.path.exists(found):  # else a file of that name comes first, as for other commands
+        found = shipped_protocols().get(str(name).replace("-", "_"), found).resolve()
     if not found.is_file():
         raise InputError(path, "protocol", str(name), f"no such file ({found})")
     try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import random
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
+from sliplab.storage.files import read_json
 from sliplab.storage.formats import export_trials as _exports
 from sliplab.storage.formats.aedat4 import Aedat4Stream, Aedat4Writer
 from sliplab.storage.streams import EventChunk
@@ -231,6 +234,24 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path) -> None:
         collected(TrialStore.open(store), ["tiny"])
 
 
+@pytest.mark.parametrize("place", ["campaigns", "campaigns/new", "campaigns/a/trials/slide/new"])
+def test_no_store_is_made_among_the_campaigns_of_one(place: str, tmp_path: Path) -> None:
+    lab_hdf5(tmp_path / "slide.h5")
+    store, remote = tmp_path / "store", f"file://{tmp_path}/remote"
+    asked = ("import", tmp_path / "slide.h5", "--name", "a", "--store")
+    assert here(*asked, store).returncode == 0
+    assert here("push", store, remote).returncode == 0
+    before = sorted(tmp_path.rglob("*"))
+    for words in ((*asked, store / place), ("pull", remote, store / place)):
+        done = here(*words)
+        assert done.returncode == 2
+        told = " ".join(done.stderr.split())
+        assert (
+            "holds other files" in told or f"lies among the campaigns of the store {store}" in told
+        )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_exports_replace_no_original_and_nothing_of_a_store(tmp_path: Path) -> None:
     originals, store, out = tmp_path / "originals", tmp_path / "store", tmp_path / "out"
     originals.mkdir()
@@ -258,6 +279,39 @@ def test_exports_replace_no_original_and_nothing_of_a_store(tmp_path: Path) -> N
         assert [here(*asked, place).returncode for _ in range(2)] == [0, 0]
     (out / "sliplab-export.json").unlink()
     assert here(*asked, out).returncode == 2
+
+
+@pytest.mark.parametrize("begun", [1, 2])
+def test_an_export_that_was_killed_may_be_run_again(begun: int, tmp_path: Path) -> None:
+    """It leaves files and no word of what it has written; a foreign file stays."""
+    store, out = tmp_path / "store", tmp_path / "out"
+    where = campaign(store)
+    for trial in ("a", "b"):
+        commit(where, trial)
+    code = f"""
+import os, sys
+from dataclasses import replace
+from sliplab.flows.__main__ import main
+from sliplab.storage.formats import export_trials as ours
+known, calls = ours.known_format("dsec"), []
+def killed(*given):
+    calls.append(given)
+    if len(calls) == {begun}:
+        given[1].write_bytes(b"half")
+        os.kill(os.getpid(), 9)
+    return known.export(*given)
+ours.known_format = lambda kind: replace(known, export=killed)
+main()
+"""
+    asked = ("export", str(store), "c", "--as", "dsec", "--output", str(out))
+    done = subprocess.run([sys.executable, "-c", code, *asked], check=False)
+    assert done.returncode == -9
+    (out / "mine.h5").write_bytes(b"mine")
+    assert [here(*asked).returncode for _ in range(2)] == [0, 0]
+    names = {"a.h5", "b.h5", "mine.h5", "sliplab-export.json"}
+    assert {path.name for path in out.iterdir()} == names
+    assert (out / "mine.h5").read_bytes() == b"mine"
+    assert "unfinished" not in read_json(out / "sliplab-export.json")
 
 
 def test_an_export_that_was_stopped_may_be_run_again(

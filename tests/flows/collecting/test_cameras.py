@@ -111,11 +111,12 @@ def test_a_protocol_that_names_a_stream_needs_a_rig_that_has_it(
 
 def test_a_rig_without_an_event_camera_says_so_when_asked_to_touch_off() -> None:
     from sliplab.rigs.build import build_rig
+    from sliplab.rigs.core.surface_search import touch_off
 
     rig = build_rig(load_rig_file(ROOT / "rigs" / "mock_frames.yaml")[0])
     rig.connect()
     with pytest.raises(RigError, match="event camera: the rig mock-frames has none"):
-        rig.touch_off(0.5, 1.5, 1)
+        touch_off(rig, 0.5, 1.5, 1)
     rig.close()
 
 

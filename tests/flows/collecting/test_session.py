@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting.session import TrialCollector
+from sliplab.flows.collecting.session import TrialCollector, open_session
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.core.capabilities import RigError, Segment
+from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.store import Campaign, StoreError, TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
@@ -52,9 +53,29 @@ def session(
     return at_rig(requested(folder))
 
 
+STEPS = [
+    "starting the fakes of 0 devices ...",
+    "touching off, warming up the skin ...",
+    "touching off: depth zero ...",
+]
+
+
 def checksums(campaign: Campaign) -> dict[str, str]:
     """One hash a committed trial."""
     return {recording.trial_id: recording.checksum for recording in campaign.recordings()}
+
+
+def test_steps_before_the_first_trial_are_said_in_real_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session(tmp_path / "a", short())
+    for in_virtual_time in (True, False):
+        monkeypatch.setattr(RigFile, "in_virtual_time", in_virtual_time)
+        with open_session(requested(tmp_path / "a")) as opened:
+            opened.collector.rig.connect()
+            opened.collector.take(opened.trials[:1])
+        said = [line for line in capsys.readouterr().err.splitlines() if line.endswith(" ...")]
+        assert said == ([] if in_virtual_time else STEPS)
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ import sliplab
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.skins import skin_section
+from sliplab.flows.collecting import preparation
 from sliplab.flows.collecting.session import TrialCollector
 from sliplab.flows.collecting.supervisor import CollectionSupervisor
 from sliplab.flows.log import add_note, log_entries
@@ -33,7 +34,6 @@ from tests.conftest import ROOT
 from tests.flows.collecting.test_session import session, short
 from tests.flows.collecting.test_watches import begin, with_references
 from tests.flows.conftest import write
-from tests.patching import put
 from tests.storage.trial_files import campaign as plain_campaign
 
 
@@ -78,18 +78,20 @@ def test_every_trial_from_then_on_has_the_skin(two_skins: tuple[TrialStore, Camp
     assert trial.to_dict()["attrs"]["skin"] in {"simulated-1", "0043"}
 
 
-def test_depth_zero_is_found_again_with_another_skin(tmp_path: Path) -> None:
+def test_depth_zero_is_found_again_with_another_skin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     work, campaign = session(tmp_path, short())
     store = TrialStore.open(tmp_path / "store")
     logging(work, campaign, store)
     zeros: list[int] = []
-    found = work.rig.rezero
+    found = preparation.rezero
 
     def rezero(*given: Any) -> Any:
         zeros.append(len(campaign.committed()))
         return found(*given)
 
-    put(work.rig, "rezero", rezero)
+    monkeypatch.setattr(preparation, "rezero", rezero)
     trials = pending_trials(work.plan, campaign)
     work.take(trials[:2])
     add_note(store, "", context={"temperature": "24 degC"})

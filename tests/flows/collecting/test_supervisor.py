@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from sliplab.flows.collecting import preparation
 from sliplab.flows.collecting import supervisor as supervising
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
 from sliplab.flows.collecting.session import TrialCollector, open_session
@@ -20,6 +21,7 @@ from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import stopping
 from sliplab.protocols import PlannedTrial
 from sliplab.protocols.program import Position
+from sliplab.rigs.core import surface_search
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials import control
@@ -112,15 +114,20 @@ def test_a_pause_that_nobody_ends_ends_the_stretch(
     refuse_paused(store)
 
 
-def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path) -> None:
+def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = short()
     warm_up = {"presses": 1, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm"}
     data["collection"]["maintenance"]["warm_up"] = warm_up
     work, campaign, store = supervised(tmp_path / "a", data)
     done: list[str] = []
-    press, touch_off = work.rig.press, work.rig.touch_off
+    press, touch_off = work.rig.press, surface_search.touch_off
     put(work.rig, "press", lambda *given: (done.append("warm up"), press(*given))[1])
-    put(work.rig, "touch_off", lambda *given: (done.append("zero"), touch_off(*given))[1])
+    for module in (preparation, surface_search):
+        monkeypatch.setattr(
+            module, "touch_off", lambda *given: (done.append("zero"), touch_off(*given))[1]
+        )
     work.supervisor.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["zero", "warm up", "zero"] * 2

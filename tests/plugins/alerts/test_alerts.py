@@ -15,7 +15,7 @@ from uuid import uuid4
 import pytest
 import yaml
 
-from sliplab.flows.running import run_records
+from sliplab.flows.running import run_records, stopping
 from sliplab.flows.status import CampaignStatus, DriftStatus, NightsLeft, StoreStatus
 from sliplab.plugins.alerts import outbox
 from sliplab.plugins.alerts.conditions import Event, events
@@ -28,7 +28,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import mask_secrets
 from sliplab.rigs.rig_file import load_rig_file, same_rig
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.trials import control
+from sliplab.storage.trials import control, lock
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
@@ -236,6 +236,29 @@ def test_a_full_disk_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert not again.add(Event("a", "disk", "no room", NOW), urgent=True)
     again.send("t", NOW + timedelta(seconds=61))
     assert receiver.taken == []
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EINVAL])
+def test_alerts_that_begin_on_a_full_disk_are_sent(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *_: object) -> int:
+        raise OSError(number, "no", str(path))
+
+    def ended(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    store = TrialStore.create(tmp_path / "s")
+    with http_server() as (port, posted):
+        address = f"json://127.0.0.1:{port}"
+        waiting = Outbox(store, [AppriseTarget(address)], 30, NOW, print)
+        waiting.add(Event("key", "idle", "it stands", NOW), True)
+        monkeypatch.setattr(lock, "_open", full)
+        monkeypatch.setattr(stopping, "wait", ended)
+        done = here("alerts", store.folder, write(tmp_path, to=[address]))
+    told = [item["message"] for item in posted]
+    assert told == ([] if number == errno.EINVAL else ["it stands"]), done.stderr
+    assert ("without a lock" in done.stderr) == bool(told)
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["while it runs", "at its next start"])

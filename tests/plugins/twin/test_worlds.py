@@ -15,6 +15,7 @@ from sliplab.plugins.simulation.scene_runs import changed
 from sliplab.plugins.simulation.settings import scene_of
 from sliplab.plugins.twin.pilots import zero_error_mm
 from sliplab.plugins.twin.worlds import touch_depth_mm
+from sliplab.rigs.core.surface_search import touch_off
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 
@@ -27,7 +28,7 @@ def zero_errors_mm(rig: RigFile, seeds: Iterable[int]) -> list[float]:
         made.connect()
         surface = devices.world.plane.pose(0.0, 0.0, 0.0).xyz_mm
         true = made.plate_frame.with_zero(0.0).position(surface).depth_mm
-        return [made.touch_off(0.5, 1.5, seed) - true for seed in seeds]
+        return [touch_off(made, 0.5, 1.5, seed) - true for seed in seeds]
     finally:
         made.close()
 

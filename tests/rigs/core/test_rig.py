@@ -19,6 +19,7 @@ from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pose import angle_deg
 from sliplab.rigs.core.rig import Rig, StopRequested
+from sliplab.rigs.core.surface_search import rezero, touch_off
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.storage.streams import (
@@ -247,7 +248,7 @@ def test_a_stop_request_is_looked_at_in_the_motion(rig: Rig) -> None:
 
 
 def test_touching_off_finds_the_surface(rig: Rig) -> None:
-    found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 5)]
+    found = [touch_off(rig, 0.5, 1.5, seed) for seed in range(1, 5)]
     assert np.abs(found).max() < 0.06  # the taught plane is the true one; depth steps are 0.2 mm
     assert rig.plate_frame.zero_mm == found[-1]
 
@@ -255,14 +256,14 @@ def test_touching_off_finds_the_surface(rig: Rig) -> None:
 def test_touching_off_finds_a_surface_that_was_taught_wrong(rig: Rig) -> None:
     origin, axes = rig.plate_frame.origin - 0.5 * rig.plate_frame.axes[2], rig.plate_frame.axes
     rig.plate_frame = PlateFrame(origin, axes)
-    assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
+    assert touch_off(rig, 0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
 
 
 @pytest.mark.parametrize("speed", [1.01, 50.0, float("nan")])
 def test_touching_off_creeps(rig: Rig, speed: float) -> None:
     notes = watched(rig)
     with pytest.raises(RigError, match="touches off at 1 mm/s at most"):
-        rig.touch_off(speed, 1.5, 1)
+        touch_off(rig, speed, 1.5, 1)
     assert notes == []
 
 
@@ -279,7 +280,7 @@ REZERO = {"every": 48, "speed": "0.5 mm/s", "search": "1.5 mm"}
 @pytest.mark.long
 def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
     rig = make_rig(**FAR_CAMERA)
-    found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 7)]
+    found = [touch_off(rig, 0.5, 1.5, seed) for seed in range(1, 7)]
     assert min(found) > 0.0  # such a skin is noticed deeper than at the shipped `touch_depth`
     assert max(found) < 0.4
 
@@ -288,27 +289,27 @@ def test_touching_off_finds_a_touch_that_shows_in_few_events() -> None:
 def test_depth_zero_is_the_mean_of_as_many_touches_as_asked_for() -> None:
     """Of three touches it is within four standard errors of the mean of 9 others."""
     rig = make_rig(**FAR_CAMERA)
-    others = [rig.touch_off(0.5, 1.5, seed) for seed in range(100, 109)]
+    others = [touch_off(rig, 0.5, 1.5, seed) for seed in range(100, 109)]
     asked = Rezero.model_validate({**REZERO, "touches": 3})
-    found = rig.rezero(asked, 1)
+    found = rezero(rig, asked, 1)
     assert rig.plate_frame.zero_mm == found.mm
     assert found.sd_mm == pytest.approx(np.std(others, ddof=1), rel=1.0)
     error = float(np.std(others, ddof=1)) * (1 / 3 + 1 / 9) ** 0.5
     assert found.mm == pytest.approx(np.mean(others), abs=4 * error)
-    assert rig.rezero(asked, 1) == found  # by its seed
-    assert rig.rezero(asked, 2) != found
+    assert rezero(rig, asked, 1) == found  # by its seed
+    assert rezero(rig, asked, 2) != found
 
 
 def test_one_touch_is_what_it_was(rig: Rig) -> None:
-    found = rig.rezero(Rezero.model_validate(REZERO), 3)
-    assert (found.mm, found.sd_mm) == (rig.touch_off(0.5, 1.5, 3), None)
+    found = rezero(rig, Rezero.model_validate(REZERO), 3)
+    assert (found.mm, found.sd_mm) == (touch_off(rig, 0.5, 1.5, 3), None)
 
 
 @pytest.mark.long
 def test_touching_off_in_much_noise_finds_the_surface_nevertheless() -> None:
     """In 50 ms nothing shows with the first of these seeds, and too late with the others."""
     rig = make_rig(event_camera={"noise_hz": 0.1})
-    assert np.abs([rig.touch_off(0.5, 1.5, seed) for seed in (1037, 1064, 1128)]).max() < 0.1
+    assert np.abs([touch_off(rig, 0.5, 1.5, seed) for seed in (1037, 1064, 1128)]).max() < 0.1
 
 
 def test_touching_off_goes_no_deeper_than_its_limit(rig: Rig) -> None:
@@ -316,7 +317,7 @@ def test_touching_off_goes_no_deeper_than_its_limit(rig: Rig) -> None:
         rig.plate_frame.origin - 5.0 * rig.plate_frame.axes[2], rig.plate_frame.axes
     )
     with pytest.raises(RigError, match=r"within 1.5 mm of the taught plane; teach"):
-        rig.touch_off(0.5, 1.5, 1)
+        touch_off(rig, 0.5, 1.5, 1)
     assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm <= -1.5 + 1e-6
 
 
@@ -326,7 +327,7 @@ def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
     )
     notes = watched(rig)
     with pytest.raises(ArmFault, match="protective stop in the phase 'touching off'"):
-        rig.touch_off(0.5, 1.5, 1)
+        touch_off(rig, 0.5, 1.5, 1)
     assert notes.index("arm.stop") < notes.index("events.stop")
     assert rig.plate_frame.zero_mm == 0.0
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.program import Position
+from sliplab.rigs.core import teaching
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError, Segment
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig, StopRequested
+from sliplab.rigs.core.surface_search import touch_off
 from sliplab.rigs.core.teaching import Creep, grab_frames, jog_poses, press_in_circles, touch
 from sliplab.rigs.core.touching import RateTouch
 from sliplab.storage.streams import FrameChunk
@@ -102,16 +104,18 @@ def test_an_arm_that_runs_on_is_stopped_at_the_limit() -> None:
 
 
 @pytest.mark.parametrize("when", [150, 300])
-def test_an_arm_that_somebody_else_stops_is_not_blamed_on_the_plane(when: int) -> None:
+def test_an_arm_that_somebody_else_stops_is_not_blamed_on_the_plane(
+    when: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rig = off(make_rig(), 5.0)
     looks = iter(range(10_000))
 
-    def seen() -> int:
+    def seen(rig: Rig) -> int:
         if next(looks) == when:
             rig.arm.stop()  # at the pendant, say
         return 0
 
-    put(rig, "central_events", seen)
+    monkeypatch.setattr(teaching, "central_events", seen)
     with pytest.raises(ArmFault, match="stopped from outside, at -"):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert depth(rig) <= -1.5 + 1e-6
@@ -141,17 +145,17 @@ def test_a_stop_request_stops_the_arm_first(looks: int, way: Any) -> None:
     assert depth(rig) <= -1.5 + 1e-6
 
 
-def test_ctrl_c_stops_the_arm_first(rig: Rig) -> None:
+def test_ctrl_c_stops_the_arm_first(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     notes = watched(rig)
-    count = rig.central_events
+    count = teaching.central_events
     looks = iter(range(200))
 
-    def interrupted() -> int:
+    def interrupted(rig: Rig) -> int:
         if next(looks) == 120:
             raise KeyboardInterrupt
-        return count()
+        return count(rig)
 
-    put(rig, "central_events", interrupted)
+    monkeypatch.setattr(teaching, "central_events", interrupted)
     with pytest.raises(KeyboardInterrupt):
         touch(rig, 0.0, 0.0, QUICK, 1)
     assert notes.index("arm.stop") < notes.index("events.stop")
@@ -202,7 +206,7 @@ def test_a_creep_that_is_none_cannot_be_asked_for(wrong: dict[str, float]) -> No
 def test_the_rate_is_that_of_touching_off(rig: Rig) -> None:
     """A protocol's `rezero` and `teach zero` find the same surface with the same seed."""
     taught = touch(rig, 0.0, 0.0, Creep(clearance_mm=1.5, search_mm=1.5), 7).depth_mm
-    assert rig.touch_off(0.5, 1.5, 7) == pytest.approx(taught, abs=0.02)
+    assert touch_off(rig, 0.5, 1.5, 7) == pytest.approx(taught, abs=0.02)
     assert RateTouch(0).limit == 10
 
 

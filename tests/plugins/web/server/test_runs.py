@@ -174,6 +174,11 @@ class Queue:
     async def get_scheduled_flow_runs_for_deployments(self, *of: Any, **to: Any) -> list[Any]:
         return [run for run in self.runs if run.id not in self.said]
 
+    async def read_flow_run(self, run: UUID) -> Any:
+        from prefect.states import Running
+
+        return SimpleNamespace(state=Running())
+
     async def set_flow_run_state(self, run: UUID, state: Any) -> Any:
         self.said[run] = f"{state.type.value}: {state.message}"
         return SimpleNamespace(status=None)
@@ -317,6 +322,13 @@ def test_a_stop_of_the_page_does_not_wait_for_the_disk(
         broken.setattr(runs, "last_number", unreadable)
         asyncio.run(served._look(client, threads))
     assert done == ["stop"]
+    with monkeypatch.context() as broken, ThreadPoolExecutor() as threads:
+        broken.setattr(runs.run_records, "end_of", lambda store, run: unreadable(store))
+        served._process, served._run = SimpleNamespace(returncode=1), client.runs[0]
+        with pytest.raises(type(error)):  # the ended run cannot be closed
+            asyncio.run(served._look(client, threads))
+    assert done == ["stop", "stop"]
+    served._process = served._run = None
     assert begun == []
     assert [run["flow"] for run in waiting(store)] == ["collect"]
     client.runs.pop()
@@ -324,7 +336,8 @@ def test_a_stop_of_the_page_does_not_wait_for_the_disk(
     assert begun == client.runs
 
 
-def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
+@pytest.mark.parametrize("moment", [True, False])
+def test_a_run_that_is_started_after_a_stop_is_begun(moment: bool, tmp_path: Path) -> None:
     """The stop is read late: the server was lost. What had waited is cancelled by any clock."""
     store, client = TrialStore.create(tmp_path / "s"), Queue("collect")
     served, threads, begun = ServedRuns(store.folder, client.flows, {}), None, list[Any]()
@@ -342,10 +355,15 @@ def test_a_run_that_is_started_after_a_stop_is_begun(tmp_path: Path) -> None:
     asyncio.run(served._look(client, threads))
     early = client.due(waited.deployment_id)
     control.ask(store, "stop", who="anna")
-    stop = datetime.fromisoformat(control.ask(store, "stop", who="ben").when)
+    request = control.ask(store, "stop", who="ben")
+    stop = datetime.fromisoformat(request.moment)
+    if not moment:  # an older version's is told to a second
+        path = store.folder / control.FOLDER / "000002.json"
+        write_json(path, {**read_json(path), "moment": ""})
+        stop = datetime.fromisoformat(request.when) + timedelta(seconds=1)
     between, later, unknown = (client.due(waited.deployment_id) for _ in range(3))
-    between.created = stop + timedelta(seconds=0.9)  # it is told to a second
-    later.created, unknown.created = stop + timedelta(seconds=1), None
+    between.created = stop - timedelta(milliseconds=1)
+    later.created, unknown.created = stop + timedelta(milliseconds=1), None
     client.runs += [early, between, later, unknown]
     served._process = None
     asyncio.run(served._look(client, threads))

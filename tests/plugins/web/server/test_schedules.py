@@ -158,6 +158,28 @@ def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
     assert f"{tmp_path / 'mine.yaml'}: " in caught.value.message
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("pilot", ROOT / "protocols/pilot.yaml"),
+        ("pilot-gravity", ROOT / "protocols/pilot_gravity.yaml"),
+        ("reflex", "reflex"),  # a file beside the schedules comes first
+        ("gravity.yaml", None),
+    ],
+)
+def test_a_built_in_protocol_is_named_without_a_path(
+    name: str, found: Path | str | None, tmp_path: Path
+) -> None:
+    (tmp_path / "reflex").write_text((ROOT / "protocols/reflex.yaml").read_text())
+    path = write(tmp_path, {**NIGHT, "protocol": name})
+    if found is None:
+        with pytest.raises(InputError, match=r"protocol = gravity.yaml: no such file"):
+            load_schedules(path)
+    else:
+        (one,) = load_schedules(path)
+        assert one.parameters["protocol"] == str(tmp_path / found)
+
+
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: is used twice"):
         load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
@@ -230,6 +252,25 @@ def test_no_run_begins_earlier_than_written(
     moment = datetime.fromisoformat(after).replace(tzinfo=UTC)
     (found,) = upcoming_runs(path, load_schedules(path), len(begins), moment)
     assert [str(time)[11:] for time in found] == begins
+
+
+@pytest.mark.parametrize(
+    ("begin", "until", "ends"),
+    [
+        ("02:30", "03:30", ["28 03:30:00+02:00", "29 03:30:00+02:00"]),  # the hour left out
+        ("02:30", "03:00", ["28 03:00:00+02:00", "29 03:00:00+02:00"]),
+        ("02:30", "06:00", ["28 06:00:00+02:00", "29 06:00:00+02:00"]),
+        ("03:30", "03:00", ["29 03:00:00+02:00", "30 03:00:00+02:00"]),  # a day less half an hour
+    ],
+)
+def test_a_window_that_begins_in_an_hour_left_out_ends_as_written(
+    begin: str, until: str, ends: list[str], tmp_path: Path
+) -> None:
+    days = {"name": "nights", "from": begin, "until": until, "days": list(DAYS)}
+    path = write(tmp_path, {**NIGHT, **days})
+    (item,) = load_schedules(path)
+    (found,) = upcoming_runs(path, [item], 2, datetime(2027, 3, 27, 12, tzinfo=UTC))
+    assert [str(item.end(time))[8:] for time in found] == ends
 
 
 def test_check_prints_upcoming_runs_with_their_ends(tmp_path: Path) -> None:
