@@ -37,9 +37,12 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.trials.catalogue import refuse_store_file
 
 BuildRig: TypeAlias = Callable[[RigFile, ShouldStop], Rig]
 RATE_HZ = 100
+LINES = ".jsonl"
+"""Suffix of the files of decisions; any other existing file may be a model or a protocol."""
 FOREVER_S = 1e9
 TURN_S = 0.0005
 """Longest turn of a thread while another one waits, s."""
@@ -132,7 +135,7 @@ def detect(
         show: show decisions on the terminal.
 
     Raises:
-        InputError: there is no folder for `out`.
+        InputError: there is no folder for `out`, or it is a file of a store or of another kind.
         RigError: a device failed; the arm is stopped.
         SafeState: slip could no longer be detected; the arm stays in contact.
         StopRequested, KeyboardInterrupt: the user stopped a motion.
@@ -241,6 +244,9 @@ def _lines(out: Path | None) -> Iterator[Callable[[TimedDecision], None]]:
         return
     if not out.parent.is_dir():
         raise InputError("--out", "", out, "must be a file in an existing folder")
+    refuse_store_file(out, "--out")
+    if out.is_file() and out.suffix.lower() != LINES:
+        raise InputError("--out", "", out, f"exists, and only a {LINES} file is replaced")
     with translated_disk_errors(out.parent, RigError), out.open("w", encoding="utf-8") as file:
 
         def write(timed: TimedDecision) -> None:
