@@ -24,7 +24,7 @@ from sliplab.analysis.networks import training
 from sliplab.flows.collecting.preparation import change_over, find_zero
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
-from sliplab.flows.detecting.sources import NetworkSource
+from sliplab.flows.detecting.sources import NamedSource, NetworkSource
 from sliplab.flows.running import console, stopping
 from sliplab.flows.ui.detect_view import DetectView
 from sliplab.protocols import InputError
@@ -136,6 +136,7 @@ def detect(
 
     Raises:
         InputError: there is no folder for `out`, or it is a file of a store or of another kind.
+            Or a calibration is of another event camera.
         RigError: a device failed; the arm is stopped.
         SafeState: slip could no longer be detected; the arm stays in contact.
         StopRequested, KeyboardInterrupt: the user stopped a motion.
@@ -167,12 +168,17 @@ def detect(
         poll = (lambda: None) if view is None else view.poll
         watch = None if request.promise is None else PromiseWatch(request.promise)
         say = functools.partial(_warn, view)
-        level = detector.set_by if isinstance(detector, AtLevel) else request.set_by
+        own = detector.set_by if isinstance(detector, AtLevel) else None
+        level = request.set_by if own is None else own
         if level is not None and not level.promised:
             say(level.words)
         stepped = functools.partial(on_step, rig)
         sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say, stepped)
         rig.connect()
+        if isinstance(request.source, NamedSource):
+            request.source.check_rig(request.rig, rig.event_serial)
+            for doubt in request.source.doubts(request.rig):
+                say(doubt)
         if request.real_time and (refused := done.enter_context(real_time())):
             say(f"the system does not allow {refused}: other programs may delay the reflex")
         reaction, interrupted = None, False
