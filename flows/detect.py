@@ -166,7 +166,9 @@ def detect(
                 view.on_decision(timed)
 
         poll = (lambda: None) if view is None else view.poll
-        watch = None if request.promise is None else PromiseWatch(request.promise)
+        watch = None
+        if request.promise is not None:
+            watch = PromiseWatch(request.promise, detector.level)
         say = functools.partial(_warn, view)
         own = detector.set_by if isinstance(detector, AtLevel) else None
         level = request.set_by if own is None else own

@@ -49,7 +49,8 @@ class AtLevel(StreamDetector):
     """
 
     def __init__(self, detector: Detector, level: float, set_by: Level | None = None) -> None:
-        self.detector, self.level, self.set_by = detector, level, set_by
+        self.detector, self.set_by = detector, set_by
+        self.level: float = level
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`. Raises DetectorError."""

@@ -194,6 +194,8 @@ class StreamDetector(Detector):
 
     span_us: int = 0
     """Span of the events that a decision rests on; 0 where it is not known."""
+    level: float | None = None
+    """Evidence above it is an alarm; None where the label alone says slip."""
 
     @property
     @abstractmethod

@@ -286,7 +286,10 @@ class DetectSink(NullSink):
         if watch is None or (self._declared and (self._moved or not self._held)):
             return
         before = watch.broken_h
-        watch.add(decision.start_us, decision.end_us, decision.valid_class >= INCIPIENT)
+        alarm = decision.valid_class >= INCIPIENT
+        if watch.level is not None:
+            alarm = decision.value > watch.level
+        watch.add(decision.start_us, decision.end_us, alarm)
         if before is None and watch.broken_h is not None:
             self._on_broken(self._promise_words(watch))
 
