@@ -143,6 +143,7 @@ def evidence(**change: object) -> Evidence:
         (lambda: evidence(slipped=np.array([np.inf])), "must be from 0 to 1, or nan"),
         (dict, "push returned dict"),
         (lambda: sys.exit(3), "SystemExit: 3"),
+        (lambda: checked(None, 0, 1), "push returned NoneType"),  # it raises a DetectorError
     ],
 )
 def test_evidence_of_another_kind_is_a_detector_error(
