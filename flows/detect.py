@@ -24,7 +24,7 @@ from sliplab.analysis.networks import training
 from sliplab.flows.collecting.preparation import change_over, find_zero
 from sliplab.flows.detecting.request import DetectRequest
 from sliplab.flows.detecting.sink import FAILURES, DetectNumbers, DetectSink, failed_device
-from sliplab.flows.detecting.sources import NetworkSource
+from sliplab.flows.detecting.sources import NamedSource, NetworkSource
 from sliplab.flows.running import console, stopping
 from sliplab.flows.ui.detect_view import DetectView
 from sliplab.protocols import InputError
@@ -37,9 +37,12 @@ from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.trials.catalogue import refuse_store_file
 
 BuildRig: TypeAlias = Callable[[RigFile, ShouldStop], Rig]
 RATE_HZ = 100
+LINES = ".jsonl"
+"""Suffix of the files of decisions; any other existing file may be a model or a protocol."""
 FOREVER_S = 1e9
 TURN_S = 0.0005
 """Longest turn of a thread while another one waits, s."""
@@ -132,7 +135,8 @@ def detect(
         show: show decisions on the terminal.
 
     Raises:
-        InputError: there is no folder for `out`.
+        InputError: there is no folder for `out`, or it is a file of a store or of another kind.
+            Or a calibration is of another event camera.
         RigError: a device failed; the arm is stopped.
         SafeState: slip could no longer be detected; the arm stays in contact.
         StopRequested, KeyboardInterrupt: the user stopped a motion.
@@ -162,14 +166,21 @@ def detect(
                 view.on_decision(timed)
 
         poll = (lambda: None) if view is None else view.poll
-        watch = None if request.promise is None else PromiseWatch(request.promise)
+        watch = None
+        if request.promise is not None:
+            watch = PromiseWatch(request.promise, detector.level)
         say = functools.partial(_warn, view)
-        level = detector.set_by if isinstance(detector, AtLevel) else request.set_by
+        own = detector.set_by if isinstance(detector, AtLevel) else None
+        level = request.set_by if own is None else own
         if level is not None and not level.promised:
             say(level.words)
         stepped = functools.partial(on_step, rig)
         sink = DetectSink(live, rig.clock, on_decision, poll, request.timeouts, watch, say, stepped)
         rig.connect()
+        if isinstance(request.source, NamedSource):
+            request.source.check_rig(request.rig, rig.event_serial)
+            for doubt in request.source.doubts(request.rig):
+                say(doubt)
         if request.real_time and (refused := done.enter_context(real_time())):
             say(f"the system does not allow {refused}: other programs may delay the reflex")
         reaction, interrupted = None, False
@@ -241,6 +252,9 @@ def _lines(out: Path | None) -> Iterator[Callable[[TimedDecision], None]]:
         return
     if not out.parent.is_dir():
         raise InputError("--out", "", out, "must be a file in an existing folder")
+    refuse_store_file(out, "--out")
+    if out.is_file() and out.suffix.lower() != LINES:
+        raise InputError("--out", "", out, f"exists, and only a {LINES} file is replaced")
     with translated_disk_errors(out.parent, RigError), out.open("w", encoding="utf-8") as file:
 
         def write(timed: TimedDecision) -> None:

@@ -37,8 +37,8 @@ def writable_target(rig: Path, out: Path | None) -> Path:
     """Return the file to write an entry to: `out`, or the rig file itself.
 
     Raises:
-        InputError: that file ships with the package, `out` is not a YAML file, or its folder does
-            not exist.
+        InputError: that file ships with the package, `out` is not a YAML file or lies in a store,
+            or its folder does not exist.
     """
     target = out or rig
     if any(path.resolve() == target.resolve() for path in shipped_rigs().values()):
@@ -55,6 +55,10 @@ def writable_target(rig: Path, out: Path | None) -> Path:
         raise InputError("--out", "", str(target), "its folder does not exist")
     if target.exists() and target.resolve() != rig.resolve():
         raise InputError("--out", "", str(target), "exists: give it as --rig, or use another name")
+    if out is not None:
+        from sliplab.storage.trials.catalogue import refuse_store_file
+
+        refuse_store_file(out, "--out")
     return target.resolve()
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import MASK, is_secret, password_in, without_passwords
+from sliplab.storage.causes import causes
 
 _FAULTS = {
     errno.ENOSPC: "is full",
@@ -71,14 +72,12 @@ def disk_fault(error: BaseException | None) -> str | None:
 
     HDF5 states some of them as text only.
     """
-    while error is not None:
-        number = error.errno if isinstance(error, OSError) else None
-        if number is None and (stated := _IN_WORDS.search(str(error))):
+    for each in causes(error):
+        number = each.errno if isinstance(each, OSError) else None
+        if number is None and (stated := _IN_WORDS.search(str(each))):
             number = int(stated[1])
         if number in _FAULTS:
             return _FAULTS[number]
-        hidden = error.__suppress_context__
-        error = error.__cause__ or (None if hidden else error.__context__)
     return None
 
 

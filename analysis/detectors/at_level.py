@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -47,7 +49,8 @@ class AtLevel(StreamDetector):
     """
 
     def __init__(self, detector: Detector, level: float, set_by: Level | None = None) -> None:
-        self.detector, self.level, self.set_by = detector, level, set_by
+        self.detector, self.set_by = detector, set_by
+        self.level: float = level
 
     def begin(self, width: int, height: int) -> None:
         """See `Detector`. Raises DetectorError."""
@@ -70,10 +73,8 @@ class AtLevel(StreamDetector):
         self._events = 0
         self._slipping, self._gross, self._share = False, False, 0.0
         self._last_us: int | None = None
-        try:
+        with _failures():
             self.detector.begin(*self._size)
-        except Exception as error:  # another package's code: whatever it raises
-            raise _failure(error) from error
 
     @property
     def settled_us(self) -> int:
@@ -95,11 +96,9 @@ class AtLevel(StreamDetector):
         self._settled_us = until_us
         start_us = self._from_us
         moved = replace(given, t_us=given.t_us - start_us)
-        try:
-            found = self.detector.push(moved, until_us - start_us)
-        except Exception as error:  # another package's code: whatever it raises
-            raise _failure(error) from error
-        found = checked(found, before_us - start_us, until_us - start_us)
+        with _failures():
+            given_back = self.detector.push(moved, until_us - start_us)
+            found = checked(given_back, before_us - start_us, until_us - start_us)
         label, slipped = self._classes(found)
         t_us = found.t_us + start_us
         windows = self._windows(given, t_us.tolist())
@@ -146,7 +145,12 @@ class AtLevel(StreamDetector):
             self._last_us = int(given.t_us[end - 1])
 
 
-def _failure(error: Exception) -> DetectorError:
-    if isinstance(error, DetectorError):
-        return error
-    return DetectorError(f"{type(error).__name__}: {error}")
+@contextmanager
+def _failures() -> Iterator[None]:
+    """Raise DetectorError for whatever another package's code raises, an exit, too."""
+    try:
+        yield
+    except DetectorError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise DetectorError(f"{type(error).__name__}: {error}") from error

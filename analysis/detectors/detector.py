@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.storage.streams import EventChunk
 
+_N = TypeVar("_N", np.int64, np.float64, np.int8)
 NO_LABEL = -1
 """Label of a decision without a class."""
 
@@ -119,9 +121,9 @@ class Evidence:
         t_us: npt.ArrayLike, value: npt.ArrayLike, label: npt.ArrayLike | None = None
     ) -> Evidence:
         """Return evidence of any numbers; without labels it has no classes."""
-        times = np.asarray(t_us, np.int64)
+        times = _cast(t_us, np.int64)
         labels = np.full(times.shape, NO_LABEL) if label is None else label
-        return Evidence(times, np.asarray(value, np.float64), np.asarray(labels, np.int8))
+        return Evidence(times, _cast(value, np.float64), _cast(labels, np.int8))
 
     @staticmethod
     def joined(parts: Sequence[Evidence]) -> Evidence:
@@ -192,6 +194,8 @@ class StreamDetector(Detector):
 
     span_us: int = 0
     """Span of the events that a decision rests on; 0 where it is not known."""
+    level: float | None = None
+    """Evidence above it is an alarm; None where the label alone says slip."""
 
     @property
     @abstractmethod
@@ -214,32 +218,63 @@ def checked(found: object, before_us: int, until_us: int) -> Evidence:
         before_us, until_us: the moments up to which events were complete before, and now.
 
     Raises:
-        DetectorError: it is none, is not of that time, or is not a number.
+        DetectorError: it is none, is not of that time, or is not made of numbers.
     """
     if not isinstance(found, Evidence):
         raise DetectorError(f"push returned {type(found).__name__}; must be Evidence")
-    n = len(found.t_us)
-    if found.slipped is not None and found.slipped.shape != (n,):
-        raise DetectorError(f"evidence has {n} times and {found.slipped.shape} shares of tips")
-    if found.value.shape != (n,) or found.label.shape != (n,):
-        raise DetectorError(
-            f"evidence has {n} times, {found.value.shape} values and {found.label.shape} labels; "
-            "must be as many"
-        )
+    t_us = _array("times", found.t_us, np.int64)
+    n = len(t_us)
+    value = _array("values", found.value, np.float64, n)
+    label = _array("labels", found.label, np.int8, n)
+    slipped = (
+        None if found.slipped is None else _array("shares of tips", found.slipped, np.float64, n)
+    )
     if not n:
-        return found
-    if (found.t_us[1:] <= found.t_us[:-1]).any():
+        return Evidence(t_us, value, label, found.windows, slipped)
+    if (t_us[1:] <= t_us[:-1]).any():
         raise DetectorError("times of evidence must increase")
-    first, last = int(found.t_us[0]), int(found.t_us[-1])
+    first, last = int(t_us[0]), int(t_us[-1])
     if first <= before_us or last > until_us:
         wrong = first if first <= before_us else last
         raise DetectorError(
             f"evidence at {wrong} us; must be after {before_us} us and not after {until_us} us, "
             "up to which it was given events"
         )
-    if np.isnan(found.value).any() or (found.value == np.inf).any():
+    if np.isnan(value).any() or (value == np.inf).any():
         raise DetectorError("a value of evidence is nan or inf; must be finite or -inf")
-    if found.label.min() < NO_LABEL or found.label.max() >= len(CLASSES):
-        wrong = int(found.label.min() if found.label.min() < NO_LABEL else found.label.max())
+    if label.min() < NO_LABEL or label.max() >= len(CLASSES):
+        wrong = label.min() if label.min() < NO_LABEL else label.max()
         raise DetectorError(f"label = {wrong}: must be -1 (none), 0, 1 or 2")
-    return found
+    if slipped is not None and ((slipped < 0) | (slipped > 1)).any():
+        raise DetectorError("a share of slipped tips must be from 0 to 1, or nan where unknown")
+    return Evidence(t_us, value, label, found.windows, slipped)
+
+
+def _array(name: str, given: object, like: type[_N], n: int | None = None) -> npt.NDArray[_N]:
+    """Return an array of evidence in its type: (n,), of any n where None.
+
+    Raises:
+        DetectorError: it is none, of another shape, or of something else than such numbers.
+    """
+    if not isinstance(given, np.ndarray):
+        kind = type(given).__name__
+        raise DetectorError(f"{name} of evidence are of type {kind}; must be a NumPy array")
+    if given.ndim != 1 or n not in (None, len(given)):
+        most = "must be one list" if n is None else "must be as many"
+        times = "" if n is None else f"{n} times, "
+        raise DetectorError(f"evidence has {times}{given.shape} {name}; {most}")
+    made = _cast(given, like)
+    if made.dtype != like and len(given):
+        must = "real numbers" if like is np.float64 else f"whole numbers in {like.__name__}"
+        raise DetectorError(f"{name} of evidence, {given.dtype}, must be {must}")
+    return made if len(made) else np.zeros(0, like)
+
+
+def _cast(given: npt.ArrayLike, like: type[_N]) -> npt.NDArray[_N]:
+    """Return an array of a type, as it is where that would change it, so that `checked` says it."""
+    here = np.asarray(given)
+    if here.dtype == like or here.dtype.kind not in "biuf":
+        return here
+    with np.errstate(invalid="ignore", over="ignore"):
+        made = here.astype(like)
+    return made if np.array_equal(made, here, equal_nan=True) else here

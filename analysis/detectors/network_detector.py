@@ -148,6 +148,8 @@ class NetworkDetector(StreamDetector):
     ) -> None:
         self._counts, self._windows, self._detection = counts, windows, detection
         self._centre_px = centre_px
+        if isinstance(detection, Tuned):
+            self.level = detection.levels.incipient
         self._length_us = windows.length_ms * 1000
         stride = self._length_us if stride_us is None else stride_us
         if stride <= 0:

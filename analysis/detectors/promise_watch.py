@@ -12,7 +12,8 @@ to 3 (tests/analysis/detectors/test_promise_watch.py).
 
 The bound holds where alarms come one by one, at a rate that what came before does not raise above
 the promised one. Bursts contradict a promise that holds in the mean; that is meant, since the
-promise was made of alarms an hour on this skin.
+promise was made of alarms an hour on this skin. Evidence that stays above the level for over a
+second is a burst: an alarm each second, as where levels are set.
 """
 
 from __future__ import annotations
@@ -31,14 +32,16 @@ class PromiseWatch:
 
     Args:
         per_hour: promised false alarms an hour, at most.
+        level: of the evidence above which is an alarm, as where levels are set; a label may last
+            longer. None: the label alone is one.
 
     Attributes:
         alarms: each lasts a second, as in `analysis.detectors.alarms`.
         broken_h: time at which the promise was contradicted; None while it is not.
     """
 
-    def __init__(self, per_hour: float) -> None:
-        self.per_hour, self.alarms = per_hour, 0
+    def __init__(self, per_hour: float, level: float | None = None) -> None:
+        self.per_hour, self.level, self.alarms = per_hour, level, 0
         self.broken_h: float | None = None
         self._us = 0
         self._until_us: int | None = None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
+from datetime import date
 from pathlib import Path
 
 from sliplab.analysis.detectors.alarms import BOUND_OF_NONE
@@ -55,6 +57,10 @@ def load_calibration(path: Path) -> DetectorCalibration:
 def _rules(found: DetectorCalibration) -> Iterator[tuple[str, object, bool, str]]:
     """Yield a key, its value, whether it can be what was measured, and what would be right."""
     width, height, hold = found.width_px, found.height_px, found.hold
+    day = None
+    with suppress(ValueError):
+        day = date.fromisoformat(found.measured)
+    yield "measured", found.measured, day is not None, "must be a day, such as 2026-11-29"
     sizes = min(width, height, found.cell_px) > 0
     yield "cell_px", found.cell_px, sizes, "cells and sensor must have a size"
     cells = -(-width // found.cell_px) * -(-height // found.cell_px)

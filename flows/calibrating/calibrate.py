@@ -196,12 +196,16 @@ def print_board(board: Board, path: Path) -> dict[str, float]:
     """Write the board with a ruler; return sizes in mm.
 
     Raises:
-        InputError: the file's name ends in neither .pdf nor .png, or its folder is missing.
+        InputError: the file's name ends in neither .pdf nor .png, its folder is missing, or it is
+            of a store.
     """
     if path.suffix.lower() not in {".pdf", ".png"}:
         raise InputError("--out", "", str(path), "must end in .pdf or .png")
     if not path.parent.is_dir():
         raise InputError("--out", "", str(path), "its folder does not exist")
+    from sliplab.storage.trials.catalogue import refuse_store_file
+
+    refuse_store_file(path, "--out")
     import matplotlib
 
     matplotlib.use("agg")

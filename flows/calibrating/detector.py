@@ -150,6 +150,7 @@ def calibrate_detector(session: CalibrationSession, motion: SkinMotion) -> Detec
         version=VERSION,
         rig=file.name,
         skin=file.skin.serial,
+        camera=rig.event_serial,
         simulated=file.simulated,
         measured=session.today.isoformat(),
         width_px=width,

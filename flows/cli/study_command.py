@@ -17,6 +17,10 @@ def study_app(study: Study[Any]) -> typer.Typer:
     """Return an application with the command of one study."""
 
     def run(as_json: bool, **options: Any) -> None:
+        if isinstance(out := options.get("out"), Path):
+            from sliplab.storage.trials.catalogue import refuse_store_file
+
+            refuse_store_file(out, "--out", again=True)
         found = study.measure(**options)
         files = {} if found.dry else {"page": study.write(found)}
         if found.error is not None:

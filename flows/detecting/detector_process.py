@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
-from sliplab.rigs.core.real_time import real_time
+from sliplab.rigs.core.real_time import BELOW, real_time
 from sliplab.storage.streams import EventChunk
 
 START_S = 180.0
@@ -25,6 +25,9 @@ TRAIN_S = 3600.0
 """The same where it trains a detector first, s."""
 PATIENT_S = 30.0
 """Timeout of an answer in virtual time, where none is late, s."""
+
+WORK = ("push", "counts")
+"""Calls that compute; the first of each process is before the arm moves (`warm_up`)."""
 
 
 @dataclass(frozen=True)
@@ -170,8 +173,13 @@ def serve_detector(
 
 
 def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any], first: bool) -> None:
-    """Answer calls until the pipe closes; `first`: with real-time priority."""
-    with real_time() if first else nullcontext(), suppress(EOFError, OSError):
+    """Answer calls until the pipe closes.
+
+    Args:
+        first: with real-time priority from the second piece of work on: in the first one, before
+            the arm moves, kernels are compiled.
+    """
+    with ExitStack() as done, suppress(EOFError, OSError):
         while True:
             what, arguments, _ = pipe.recv()
             answer: tuple[bool, Any]
@@ -179,6 +187,9 @@ def _answer(pipe: Connection, work: Callable[[str, tuple[Any, ...]], Any], first
                 answer = True, work(what, arguments)
             except Exception as error:
                 answer = False, repr(error)
+            if first and what in WORK:
+                done.enter_context(real_time(BELOW))
+                first = False
             pipe.send(answer)
 
 

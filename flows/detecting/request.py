@@ -42,7 +42,7 @@ class DetectRequest:
         plan, trial: the motion that is made; None where the rig is only listened to.
         seconds: how long to listen; None until the user ends it.
         promise: false alarms an hour, at most, that are watched; None without a promise.
-        set_by: the promise that set a tuned detector's level.
+        set_by: the promise of a level, and what was measured for it.
     """
 
     rig: RigFile
@@ -112,7 +112,8 @@ def make_detect_request(
     Args:
         model: a network; None where `detector` is another one.
         detector: instead of the network with the protocol's rule, or instead of the rule.
-        promise, set_by: as `DetectRequest`. By default a calibrated detector's own promise.
+        promise, set_by: as `DetectRequest`. By default a calibrated detector's own promise, on its
+            own rig.
 
     Raises:
         InputError: rig, model, protocol, trial or reflex; the message says what would be right.
@@ -124,8 +125,8 @@ def make_detect_request(
     if isinstance(detector, NamedSource):
         detector.check_rig(file)
         source = partial(_named, detector)
-        if promise is None and detector.skin is not None:
-            promise = detector.skin.hold.high
+        set_by = detector.promised_on(file, promise) or set_by
+        promise = promise if set_by is None else set_by.asked
     else:
         assert model is not None
         source = _network(model, stride_ms, detector, change)

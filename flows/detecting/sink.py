@@ -50,8 +50,9 @@ FAILURES: dict[type[Exception], str] = {
 
 
 def failed_device(error: Exception) -> str:
-    """Return the device of one of `FAILURES`."""
-    return next(device for kind, device in FAILURES.items() if isinstance(error, kind))
+    """Return the device of one of `FAILURES`; of any other error the detector."""
+    found = (device for kind, device in FAILURES.items() if isinstance(error, kind))
+    return next(found, "detector")
 
 
 @dataclass(frozen=True)
@@ -232,13 +233,14 @@ class DetectSink(NullSink):
             self._alive_ns = here_ns
 
     def _decided(self, work: Callable[[], list[LiveDecision]]) -> list[LiveDecision]:
-        """Return the decisions of `work`; a failing detector is a lost sense while `guarded`."""
+        """Return the decisions of `work`; while `guarded`, whatever fails in it is a lost sense."""
         try:
             return work()
-        except tuple(FAILURES) as error:
+        except Exception as error:
             if not self.guarded:
                 raise
-            raise SenseLost(f"{failed_device(error)}: {error}") from error
+            said = str(error) if type(error) in FAILURES else f"{type(error).__name__}: {error}"
+            raise SenseLost(f"{failed_device(error)}: {said}") from error
 
     def _report(self, made: list[LiveDecision], here_ns: int, began_ns: int) -> None:
         slip: DetectionTimes | None = None
@@ -284,7 +286,10 @@ class DetectSink(NullSink):
         if watch is None or (self._declared and (self._moved or not self._held)):
             return
         before = watch.broken_h
-        watch.add(decision.start_us, decision.end_us, decision.valid_class >= INCIPIENT)
+        alarm = decision.valid_class >= INCIPIENT
+        if watch.level is not None:
+            alarm = decision.value > watch.level
+        watch.add(decision.start_us, decision.end_us, alarm)
         if before is None and watch.broken_h is not None:
             self._on_broken(self._promise_words(watch))
 

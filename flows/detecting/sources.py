@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import TypeAlias
 
+from sliplab.analysis.detectors.alarms import Level
 from sliplab.analysis.detectors.at_level import AtLevel
 from sliplab.analysis.detectors.detector import StreamDetector
 from sliplab.analysis.detectors.detectors import Tuned
@@ -25,6 +27,10 @@ from sliplab.protocols.detection import Detection
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.schema.detector import DetectorCalibration
+from sliplab.storage.schema.evaluation import AlarmRate
+
+FRESH_DAYS = 30
+"""Age from which `detect` says how old a calibration is; hot cells come and skins wear."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +117,15 @@ class NamedSource:
         """What is shown of it."""
         return f"detector {self.name}"
 
-    def check_rig(self, file: RigFile) -> None:
-        """Raise InputError if its calibration is of another skin, or of a simulated one."""
+    def check_rig(self, file: RigFile, camera: str | None = None) -> None:
+        """Refuse a calibration whose figures cannot hold on a rig.
+
+        Args:
+            camera: serial number of its event camera, where it is known.
+
+        Raises:
+            InputError: it is of another skin or camera, or of a simulated one.
+        """
         if (skin := self.skin) is None:
             return
         again = f"run `sliplab calibrate detector --rig {file.name}`"
@@ -122,6 +135,45 @@ class NamedSource:
         if skin.simulated and not file.simulated:
             right = f"must be false: the rig {file.name} is real; {again}"
             raise InputError(self.name, "simulated", "true", right)
+        if None not in (camera, skin.camera) and camera != skin.camera:
+            right = f"must be the event camera of the rig {file.name}, '{camera}', whose hot cells "
+            raise InputError(self.name, "camera", skin.camera, f"{right}it leaves out: {again}")
+
+    def doubts(self, file: RigFile) -> list[str]:
+        """Return why the figures of its calibration may not hold on a rig."""
+        if (skin := self.skin) is None:
+            return []
+        found = []
+        if skin.rig != file.name:
+            found.append(f"on the rig {skin.rig}, not {file.name}")
+        if (days := (date.today() - date.fromisoformat(skin.measured)).days) > FRESH_DAYS:
+            found.append(f"{days} days ago")
+        return [
+            f"{self.name} was measured {each}: hot cells, level and promise may not hold; run "
+            f"`sliplab calibrate detector --rig {file.name}`"
+            for each in found
+        ]
+
+    def promised_on(self, file: RigFile, asked: float | None) -> Level | None:
+        """Return what the false alarms of its calibration promise for its level on a rig.
+
+        A lower level and another rig have no hour that was measured.
+
+        Args:
+            asked: false alarms an hour, at most; None: what the calibration promises.
+
+        Returns:
+            None where trials set the level, and where nothing is asked and nothing measured.
+        """
+        skin, level = self.skin, self.level
+        if level is None:
+            return None
+        found = AlarmRate(alarms=0, hours=0.0, value=0.0, low=None, high=None)
+        if skin is not None and level >= skin.level and skin.rig == file.name:
+            found = skin.hold
+        most = found.high if asked is None else asked
+        held = found.high is not None and most is not None and found.high <= most
+        return None if most is None else Level(most, level, found, held)
 
     @property
     def most(self) -> None:

@@ -1,6 +1,7 @@
 """This process: its standard streams, the system's limits, its parent, its garbage collector.
 
-Loads nothing but Python's own modules: the command line reads it where nothing else can be loaded.
+Loads nothing but Python's own modules, and `storage.causes`: the command line reads it where
+nothing else can be loaded.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
+
+from sliplab.storage.causes import causes
 
 PATIENCE_S = 1.0
 """Time for which standard error may block before messages are dropped, s."""
@@ -154,10 +157,10 @@ def exhausted(error: BaseException | None) -> str | None:
 
     The causes of chained errors are examined, too.
     """
-    while error is not None:
-        number = error.errno if isinstance(error, OSError) else None
-        text = str(error)
-        if isinstance(error, MemoryError) or number == errno.ENOMEM or _MEMORY.search(text):
+    for each in causes(error, hidden=True):
+        number = each.errno if isinstance(each, OSError) else None
+        text = str(each)
+        if isinstance(each, MemoryError) or number == errno.ENOMEM or _MEMORY.search(text):
             given = _limit(resource.RLIMIT_AS, "-v", 1024)
             return f"there is not enough memory{given}: {_RAISE}, {_GO_ON}"
         if number in {errno.EMFILE, errno.ENFILE} or _FILES.search(text):
@@ -167,7 +170,6 @@ def exhausted(error: BaseException | None) -> str | None:
         if number == errno.EAGAIN or _PROCESSES.search(text):
             given = _limit(resource.RLIMIT_NPROC, "-u")
             return f"no more processes or threads can be started{given}: end some, {_GO_ON}"
-        error = error.__cause__ or error.__context__
     return None
 
 

@@ -82,6 +82,7 @@ def align_(
     from sliplab.plugins.align.events import events_from
     from sliplab.plugins.align.taps import align_taps
     from sliplab.protocols.adapter_parts import TIME_UNITS
+    from sliplab.storage.trials.catalogue import refuse_store_file
 
     if unit is not None and unit not in TIME_UNITS:
         raise InputError("--unit", "", unit, "must be one of s, ms, us, ns")
@@ -97,6 +98,8 @@ def align_(
         raise InputError("B.csv", "", b, "must be a file with a signal: --taps finds taps in it")
     if out is not None and not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")
+    if out is not None:
+        refuse_store_file(out, "--out")
     for given in (a, b, times):
         if out is not None and given is not None and Path(out).resolve() == Path(given).resolve():
             raise InputError("--out", "", str(out), "is read, too; name another file")

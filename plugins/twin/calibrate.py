@@ -108,6 +108,8 @@ def request(
         raise InputError("--out", "", str(out), "must end in .yaml")
     if not out.parent.is_dir():
         raise InputError("--out", "", str(out), "its folder does not exist")
+    if out.resolve() == rig_path.resolve():
+        raise InputError("--out", "", str(out), "is the rig file that is fitted; name another file")
     for path in (out, cheapest_path(out)):
         if path.exists() and load_rig_file(path)[0].twin is None:
             raise InputError("--out", "", str(path), "exists and is no twin: use another name")

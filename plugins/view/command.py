@@ -30,6 +30,7 @@ def view(
     """Show a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
     from sliplab.plugins.view import view as looking
     from sliplab.storage.remote.mirror import open_store
+    from sliplab.storage.trials.catalogue import refuse_store_file
 
     subject = looking.find(open_store(store), trial, campaign)
     if save is None:
@@ -39,6 +40,7 @@ def view(
         return
     if save.suffix.lower() != ".rrd" or not save.parent.is_dir():
         raise InputError("--save", "", str(save), "must end in .rrd and its folder must exist")
+    refuse_store_file(save, "--save")
     counts = looking.save(subject, save)
     if as_json:
         console.print_json({"file": str(save), "trial": trial, **counts})

@@ -32,6 +32,7 @@ from sliplab.protocols.program import (
 from sliplab.protocols.timing import ForceTiming, StreamTiming, Timing
 from sliplab.rigs.core import force_watch
 from sliplab.rigs.core.capabilities import (
+    UNKNOWN,
     Arm,
     ArmFault,
     ArmState,
@@ -285,6 +286,13 @@ class Rig:
         """
         found = [device.health() for device in self._devices() if hasattr(device, "health")]
         return [report for report in found if report is not None]
+
+    @property
+    def event_serial(self) -> str | None:
+        """Serial number of the event camera; None where it reports none. Raises RigError."""
+        report = getattr(self.event_camera, "health", None)
+        serial: str = UNKNOWN if report is None else report().serial
+        return None if serial == UNKNOWN else serial
 
     def describe(self) -> dict[str, Json]:
         """Return settings, counts and losses of the trial that just ran, by device."""

@@ -39,6 +39,8 @@ class DetectorCalibration(Document):
     rig: str
     skin: str
     """Serial number."""
+    camera: str | None = None
+    """Serial number of the event camera; null where it reports none, and in older files."""
     simulated: Bool
     measured: str
     """Day, 2026-11-29."""

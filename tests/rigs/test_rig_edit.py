@@ -16,6 +16,7 @@ from sliplab.rigs import rig_edit
 from sliplab.rigs.rig_edit import edited, writable_target, write_entries
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
+from sliplab.storage.trials.store import TrialStore
 from tests.conftest import ROOT
 from tests.rigs.core.test_calibration import WHOLE
 
@@ -108,9 +109,11 @@ def test_shipped_files_are_never_written_to(tmp_path: Path) -> None:
 
 def test_targets_that_cannot_be(path: Path, tmp_path: Path) -> None:
     (tmp_path / "other.yaml").write_text("")
+    (store := TrialStore.create(tmp_path / "s").folder / "campaigns").mkdir(exist_ok=True)
     for out, says in (
         (tmp_path / "other.yaml", "exists: give it as --rig"),
         (tmp_path / "new.txt", "must end in .yaml"),
+        (store / "new.yaml", "belongs to the store"),
         (tmp_path / "nowhere" / "new.yaml", "folder does not exist"),
     ):
         with pytest.raises(InputError, match=says):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.detectors.at_level import AtLevel
-from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene, Slip
+from sliplab.analysis.detectors.detector import (
+    Detector,
+    DetectorError,
+    Evidence,
+    Scene,
+    Slip,
+    checked,
+)
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.live import LiveDetector
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT, NO_SLIP
 from sliplab.storage.streams import EventChunk
+from tests.patching import put
 from tests.plugins.bench.made import Counting
 
 STEP_US = 10_000
@@ -106,6 +116,52 @@ def test_a_detector_that_fails_is_an_error(value: float, said: str) -> None:
     live = LiveDetector(AtLevel(Saying(value), 0.0), origin_us=0)
     with pytest.raises(DetectorError, match=said):
         live.advance(STEP_US)
+
+
+def evidence(**change: object) -> Evidence:
+    good = {"t_us": np.array([STEP_US]), "value": np.array([1.0]), "label": np.array([-1], np.int8)}
+    return Evidence(**{**good, **change})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: evidence(value=None), "values of evidence are of type NoneType"),
+        (lambda: evidence(t_us=[STEP_US]), "times of evidence are of type list"),
+        (lambda: evidence(t_us=np.array(5)), r"evidence has \(\) times; must be one list"),
+        (lambda: evidence(t_us=np.array([np.nan])), "times of evidence, float64, must be whole"),
+        (lambda: evidence(t_us=np.array([5.5])), "times of evidence, float64, must be whole"),
+        (lambda: Evidence.of([5.5], [1.0]), "times of evidence, float64, must be whole"),
+        (lambda: evidence(value=np.array(["x"])), "values of evidence, <U1, must be real"),
+        (lambda: evidence(value=np.array([1j])), "values of evidence, complex128, must be real"),
+        (lambda: Evidence.of([5], [1j]), "values of evidence, complex128, must be real"),
+        (lambda: evidence(value=np.zeros(2)), "must be as many"),
+        (lambda: evidence(label=np.array([np.nan])), "labels of evidence, float64, must be whole"),
+        (lambda: evidence(label=np.array([0.7])), "labels of evidence, float64, must be whole"),
+        (lambda: Evidence.of([5], [1.0], [256]), "labels of evidence, int64, must be whole"),
+        (lambda: evidence(slipped=[0.5]), "shares of tips of evidence are of type list"),
+        (lambda: evidence(slipped=np.array([np.inf])), "must be from 0 to 1, or nan"),
+        (dict, "push returned dict"),
+        (lambda: sys.exit(3), "SystemExit: 3"),
+        (lambda: checked(None, 0, 1), "push returned NoneType"),  # it raises a DetectorError
+    ],
+)
+def test_evidence_of_another_kind_is_a_detector_error(
+    made: Callable[[], Evidence], said: str
+) -> None:
+    detector = Saying(0.0)
+    put(detector, "push", lambda events, until_us: made())
+    live = LiveDetector(AtLevel(detector, 0.0), origin_us=0)
+    with pytest.raises(DetectorError, match=said) as found:
+        live.advance(STEP_US)
+    assert found.value.__cause__ is not found.value
+
+
+def test_evidence_in_other_types_of_the_same_numbers_is_taken() -> None:
+    made = evidence(t_us=np.array([9.0]), value=np.array([2]), label=np.array([1]))
+    taken = checked(made, 0, 10)
+    assert (taken.t_us.dtype, taken.value.dtype, taken.label.dtype) == (np.int64, float, np.int8)
+    assert not len(checked(Evidence(np.array([]), np.array([]), np.array([])), 0, 10))
 
 
 class Tips(Detector):

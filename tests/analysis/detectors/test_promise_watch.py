@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from sliplab.analysis.detectors.alarms import alarm_times
 from sliplab.analysis.detectors.promise_watch import PromiseWatch
 
 RUNS = 400
@@ -49,6 +52,17 @@ def test_time_counts_once_and_an_alarm_lasts_a_second() -> None:
     assert watch.hours == pytest.approx(90_000 / HOUR_US)
     assert watch.evidence == pytest.approx((1.5**2 + 2**2 + 3**2 + 5**2 + 10**2) / 5, rel=1e-3)
     assert "contradict at most 1 false alarms an hour" in watch.words
+
+
+@settings(max_examples=50)
+@given(st.lists(st.booleans(), max_size=60))
+def test_alarms_are_counted_as_where_levels_are_set(above: list[bool]) -> None:
+    """At steps of 150 ms: what lasts longer than a second is several."""
+    watch, step_us = PromiseWatch(1.0), 150_000
+    for k, alarm in enumerate(above):
+        watch.add(k * step_us, (k + 1) * step_us, alarm)
+    ends_us = (np.flatnonzero(above) + 1).astype(np.int64) * step_us
+    assert watch.alarms == len(alarm_times(ends_us))
 
 
 def test_many_alarms_and_long_times_are_numbers() -> None:

@@ -125,6 +125,7 @@ def test_a_skin_that_was_not_seen_writes_nothing(tmp_path: Path) -> None:
         ({"places": []}, "places = 0: some must have moved"),
         ({"fewest_places": 0}, "fewest_places = 0"),
         ({"cell_px": 0}, "cell_px = 0"),
+        ({"measured": "lately"}, "measured = lately: must be a day"),
     ],
 )
 def test_a_document_of_another_kind_is_refused(

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from sliplab.flows.running.process import exhausted, too_few_threads
-from sliplab.storage.errors import StoreError
+from sliplab.storage.causes import causes
+from sliplab.storage.errors import StoreError, disk_full
 from sliplab.storage.trials.store import TrialStore
 from sliplab.storage.trials.verify import verify
 from tests.command_line import here
@@ -91,6 +92,15 @@ def test_what_has_run_out_is_said(
     if not hidden or exhausted(raised):
         assert message in json.loads(done.stdout)["error"]["message"]
     assert done.stderr.count("\n") == 1
+
+
+def test_an_error_that_caused_itself_is_no_endless_search() -> None:
+    first, second = ValueError("broken"), OSError(errno.ENOSPC, "no space")
+    first.__cause__ = first
+    second.__context__, first.__context__ = first, second
+    assert exhausted(first) is None
+    assert disk_full(second)
+    assert [*causes(second)] == [second, first]
 
 
 def test_without_processes_a_collection_ends_in_one_line(

@@ -19,6 +19,7 @@ from sliplab.rigs.build import ShouldStop
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -156,6 +157,21 @@ def test_a_file_without_a_folder_is_said_before_anything_moves(
     rigs: list[Rig] = []
     with pytest.raises(InputError, match="--out"):
         detect(ordered(model, protocol), tmp_path / "no" / "d.jsonl", build=keeping(rigs))
+    assert rigs == []
+
+
+def test_only_a_file_of_lines_is_replaced(model: Path, protocol: Path, tmp_path: Path) -> None:
+    folder = TrialStore.create(tmp_path / "s").folder
+    (lines := folder / "runs.jsonl").write_text("")
+    (folder / "campaigns").mkdir(exist_ok=True)
+    rigs: list[Rig] = []
+    for out in (model, protocol, lines, folder / "campaigns" / "new.jsonl"):
+        before = out.exists() and out.read_bytes()
+        with pytest.raises(
+            InputError, match=r"--out = .*(only a \.jsonl file|belongs to the store)"
+        ):
+            detect(ordered(model, protocol), out, build=keeping(rigs))
+        assert (out.exists() and out.read_bytes()) == before
     assert rigs == []
 
 

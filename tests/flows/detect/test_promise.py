@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sliplab.analysis.detectors.at_level import AtLevel
+from sliplab.analysis.detectors.detector import Detector, Evidence
 from sliplab.flows.detect import detect
 from sliplab.flows.detecting.request import make_detect_request
 from sliplab.flows.detecting.sources import named_source
+from sliplab.storage.streams import EventChunk
 from tests.command_line import here
 from tests.flows.detect.detecting import RIG
 
@@ -26,8 +31,31 @@ def test_alarms_while_listening_contradict_a_promise(capsys: pytest.CaptureFixtu
     assert "at most 1 false alarms an hour" in promise["says"]
     assert promise["says"].endswith("unless something slipped")
     warned = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    assert len(warned) == 1
-    assert "2 alarms in" in warned[0]
+    assert "0 h without slip bound no rate" in warned[0], "nothing was measured at this level"
+    assert "2 alarms in" in warned[1]
+    assert len(warned) == 2
+
+
+class Lasting(Detector):
+    """One alarm at 100 ms, after which tips count as slipped: the label says slip on."""
+
+    def begin(self, width: int, height: int) -> None:
+        self._said = 0
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        t_us = np.arange(self._said + 100_000, until_us + 1, 100_000)
+        self._said = int(t_us[-1]) if len(t_us) else self._said
+        value = (t_us == 100_000).astype(float)
+        return replace(Evidence.of(t_us, value), slipped=np.full(len(t_us), 0.5))
+
+
+def test_a_label_that_lasts_is_one_alarm_as_where_levels_are_set() -> None:
+    source = named_source("never", 0.5, None)
+    order = make_detect_request(RIG, None, detector=source, seconds=3, promise=1.0)
+    result = detect(order, detector=AtLevel(Lasting(), 0.5), show=False)
+    assert result["states"]["incipient"] > 20
+    assert result["promise"] is not None
+    assert result["promise"]["alarms"] == 1
 
 
 def test_a_detector_that_says_nothing_keeps_any(capsys: pytest.CaptureFixture[str]) -> None:
@@ -36,7 +64,7 @@ def test_a_detector_that_says_nothing_keeps_any(capsys: pytest.CaptureFixture[st
     promise = detect(order)["promise"]
     assert promise is not None
     assert (promise["alarms"], promise["broken_h"]) == (0, None)
-    assert "warning" not in capsys.readouterr().err
+    assert "contradict" not in capsys.readouterr().err
 
 
 def test_in_a_trial_the_hold_counts_and_its_motion_does_not(protocol: Path) -> None:

@@ -190,6 +190,18 @@ def test_a_late_decision_leads_to_the_safe_state(gripping: Gripping) -> None:
     assert len(asked) < 30
 
 
+def test_whatever_a_detector_raises_leads_to_the_safe_state(gripping: Gripping) -> None:
+    asked: list[int] = []
+
+    def failing(x: np.ndarray) -> np.ndarray:
+        asked.append(1)
+        return quiet(x) if len(asked) < 25 else quiet(x).no_such_thing
+
+    error, rig = safe_state(gripping(), failing)
+    assert "detector: AttributeError: 'numpy.ndarray' object has no attribute" in error.cause
+    assert rig.position().depth_mm > 2.0
+
+
 def test_a_gripper_that_fails_leaves_the_arm_stopped_in_contact(gripping: Gripping) -> None:
     order = gripping(mock=gone("gripper", 0.6))
     error, rig = safe_state(order, slip_when_busy())

@@ -320,6 +320,8 @@ def test_what_cannot_be_fitted_is_refused_before_anything_is_simulated(
     other.write_text("extends: rehearsal\nname: mine\n")
     with pytest.raises(InputError, match="exists and is no twin"):
         calibrate.request(Path("rehearsal"), other, 100, 0.5, 1)
+    with pytest.raises(InputError, match="is the rig file that is fitted"):
+        calibrate.request(other, other, 100, 0.5, 1)
     for level, reason in (("L3", "has no label yet"), ("L1", "was simulated at level L1")):
         rig = tmp_path / f"{level}.yaml"
         rig.write_text(f"extends: rehearsal\nname: some\nmock: {{scene: {{level: {level}}}}}\n")

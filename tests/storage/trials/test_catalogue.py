@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import make_folder, write_json
+from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.trials import catalogue as module
 from sliplab.storage.trials.catalogue import (
     catalogue,
@@ -254,6 +254,17 @@ def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
     check_table_path(tmp_path / "mine.csv")
     assert here("schema", "trial", "--out", folder / "store.json").returncode == 2
     assert here("trials", folder, "--output", folder / "store.json").returncode == 2
+    inside, csv = folder / "campaigns", tmp_path / "a.csv"
+    inside.mkdir(exist_ok=True)
+    write_text(csv, "t\n1\n2\n3\n")
+    for words in (
+        ("calibrate", "board", "--out", inside / "board.pdf"),
+        ("align", csv, csv, "--out", inside / "t.csv"),
+        ("reflex", folder, "--out", inside / "page"),
+    ):
+        done = here(*words)
+        assert done.returncode == 2
+        assert "belongs to the store" in done.stderr
     TrialStore.open(folder)
 
 
