@@ -14,10 +14,10 @@ from itertools import pairwise
 from sliplab.protocols.claims import repeated
 from sliplab.protocols.factors import Factor, unknown_factor
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.model import Collection, Protocol
 from sliplab.protocols.motion import check_reference_limits
 from sliplab.protocols.phases import PlateMotion
+from sliplab.protocols.protocol_limits import MAX_CREEP_MM_S
 from sliplab.protocols.quantity import canonical, check_size
 from sliplab.protocols.split import Split, check_split
 from sliplab.protocols.yaml_file import StrictModel, raise_all

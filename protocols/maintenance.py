@@ -10,10 +10,6 @@ from sliplab.protocols.factors import MAX_TRIALS, ContextLevel
 from sliplab.protocols.quantity import PositiveMillimetres, PositiveSpeed
 from sliplab.protocols.yaml_file import StrictModel
 
-MAX_CREEP_MM_S = 1.0
-"""Highest speed towards a surface that is searched for: the arm goes on while a touch is noticed,
-deeper than the limits at a higher one, and depth zero is off by as much."""
-
 
 class ReferenceSettings(StrictModel):
     """One condition taken again and again, to see the skin wear and the rig drift."""

@@ -188,7 +188,7 @@ class EvaluatedTrials:
         return HoldoutScores(
             **dict(metrics.score(counts, y, margin)),
             strict=window_groups.share(window_groups.strict_hits(counts, y), trial),
-            argmax=window_groups.share(window_groups.credit(counts, y), trial),
+            argmax=window_groups.share(metrics.credit(counts, y), trial),
         )
 
 

@@ -206,7 +206,7 @@ def compared(
     trial: npt.NDArray[np.int64],
 ) -> Baseline:
     """Compare another method's votes (n, 3) with the network's counts, on the same windows."""
-    ours, theirs = window_groups.credit(counts, y), window_groups.credit(votes, y)
+    ours, theirs = metrics.credit(counts, y), metrics.credit(votes, y)
     found = window_groups.share(theirs, trial)
     return Baseline(
         argmax=found.share,
@@ -250,7 +250,7 @@ def intervals_of(
     true, called = y == metrics.INCIPIENT, stated == metrics.INCIPIENT
     both = (true & called).astype(np.float64)
     return WindowIntervals(
-        accuracy=window_groups.share(window_groups.credit(counts, y), trial),
+        accuracy=window_groups.share(metrics.credit(counts, y), trial),
         incipient_precision=window_groups.share(both[called], trial[called]),
         incipient_recall=window_groups.share(both[true], trial[true]),
     )

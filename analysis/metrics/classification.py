@@ -76,7 +76,7 @@ def accuracy(counts: Counts, labels: Labels, margin: float = 0.0) -> Accuracy:
     n = len(labels)
     if n == 0:
         return Accuracy(argmax=None, strict=None, margin=None, n=0)
-    top = counts == counts.max(axis=1, keepdims=True)
+    top = _best(counts)
     hit = top[np.arange(n), labels]
     # as fractions, so that the sum is exact in any order
     ties = np.bincount(top.sum(axis=1)[hit]).tolist()
@@ -87,6 +87,18 @@ def accuracy(counts: Counts, labels: Labels, margin: float = 0.0) -> Accuracy:
         margin=int((winners(counts, margin) == labels).sum()) / n,
         n=n,
     )
+
+
+def credit(scores: Counts, labels: Labels) -> npt.NDArray[np.float64]:
+    """Score of each window for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
+    scores, labels = check(scores, labels)
+    top = _best(scores)
+    return np.asarray(top[np.arange(len(labels)), labels] / np.maximum(top.sum(axis=1), 1))
+
+
+def _best(scores: Counts) -> npt.NDArray[np.bool_]:
+    """Return where each window has its highest score, (n, K); all classes that tie for it."""
+    return np.asarray(scores == scores.max(axis=1, keepdims=True))
 
 
 def confusion(counts: Counts, labels: Labels) -> IntArray:

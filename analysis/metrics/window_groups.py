@@ -31,15 +31,6 @@ TENTHS = 10
 """Parts of a phase."""
 
 
-def credit(scores: Counts, labels: Labels) -> FloatArray:
-    """Score of each window for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
-    scores, labels = check(scores, labels)
-    top = (
-        scores == scores.max(axis=1, keepdims=True) if len(scores) else np.zeros(scores.shape, bool)
-    )
-    return np.asarray(top[np.arange(len(labels)), labels] / np.maximum(top.sum(axis=1), 1))
-
-
 def strict_hits(counts: Counts, labels: Labels) -> FloatArray:
     """1 where the unique winner is right, else 0; (n,)."""
     counts, labels = check(counts, labels)

@@ -59,6 +59,7 @@ class DetectorSection(Content):
     Attributes:
         trials: by split.
         smoothing: windows that the paper's rule averages.
+        first_slip_ms: as of an `Experiment`, kinematic.
     """
 
     template: ClassVar[str] = "detectors.html"
@@ -66,14 +67,19 @@ class DetectorSection(Content):
     trials: PartTrials
     smoothing: int
     best: Best | None
+    first_slip_ms: float | None
     figure: Figure
     tables: Sequence[Table]
 
 
 def detector_section(
-    compared: DetectorComparison | None, *, simulated: bool
+    compared: DetectorComparison | None, first_slip_ms: float | None, *, simulated: bool
 ) -> DetectorSection | None:
-    """Show the comparison; None if there is none."""
+    """Show the comparison; None if there is none.
+
+    Args:
+        first_slip_ms: as of an `Experiment`, kinematic.
+    """
     if compared is None:
         return None
     entries = titled(compared)
@@ -104,8 +110,9 @@ def detector_section(
         compared.trials,
         entries[0][1].rates[0].choice,
         _best(entries),
+        first_slip_ms,
         Figure(
-            latency_over_rate(panels, simulated=simulated),
+            latency_over_rate(panels, first_slip_ms, simulated=simulated),
             name="detectors",
             data={str(name): column for name, column in points.to_dict("list").items()},
         ),

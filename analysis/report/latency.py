@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import median
 from typing import ClassVar
 
@@ -11,7 +12,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
 from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.intervals import Panel, by_condition
-from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.report.figures.style import BLUE, FIRST_SLIP, GREEN, ORANGE, RED
 from sliplab.analysis.report.outcomes import (
     CAUSE,
     LEAST,
@@ -155,7 +156,7 @@ def latency_section(
         {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
         clocks.latency_note(summary.sync, summary.labels),
         clocks.figure_note(summary.sync),
-        _figures(experiment, found, by, summary.simulated),
+        _figures(numbers, experiment, found, by, summary.simulated),
         _statistics(numbers, kinds),
         _accounts(experiment, numbers.accounted),
         [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
@@ -202,9 +203,10 @@ def choice_note(chosen_by: str) -> str:
 
 
 def _figures(
-    experiment: str, found: Conditions, by: Sequence[str], simulated: bool
+    numbers: Experiment, experiment: str, found: Conditions, by: Sequence[str], simulated: bool
 ) -> list[Figure]:
     """Draw the experiment's times by condition."""
+    draw = partial(draw_times, simulated=simulated, first_slip_ms=numbers.first_slip_ms)
     if experiment == "kinematic":
         groups, breaks = {"all test trials": found.trials}, []
         for factor in by:
@@ -212,13 +214,13 @@ def _figures(
             groups |= {
                 f"{factor} {text}": found.at(**{factor: text}) for text in found.factors[factor]
             }
-        return [draw_times(groups, TIMES[1:3], breaks, "latency-kinematic", simulated)]
+        return [draw(groups, TIMES[1:3], breaks, "latency-kinematic")]
     groups, breaks = found.cells(by), found.breaks(by)
     if experiment == "disturbance":
-        return [draw_times(groups, TIMES[1:], breaks, "disturbance", simulated)]
+        return [draw(groups, TIMES[1:], breaks, "disturbance")]
     return [
-        draw_times(groups, TIMES[:2], breaks, "gravity-incipient", simulated),
-        draw_times(groups, TIMES[2:], breaks, "gravity-gross", simulated),
+        draw(groups, TIMES[:2], breaks, "gravity-incipient"),
+        draw(groups, TIMES[2:], breaks, "gravity-gross"),
     ]
 
 
@@ -228,6 +230,7 @@ def draw_times(
     breaks: Sequence[int],
     name: str,
     simulated: bool,
+    first_slip_ms: float | None = None,
 ) -> Figure:
     """Draw times of trials, a panel each.
 
@@ -236,13 +239,17 @@ def draw_times(
         shown: which of `TIMES`.
         breaks: rows that begin a new group.
         name: of the figure.
+        first_slip_ms: as of an `Experiment`.
     """
     panels = []
     for time in shown:
         label, colour, zero = AXES[time]
         values = {row: times(found, time) for row, found in groups.items()}
         notes = {row: _lacking(found, time) for row, found in groups.items()}
-        panels.append(Panel(label, values, colour, zero, notes, LEAST[time]))
+        limit = None
+        if time == "latency_incipient_ms" and first_slip_ms is not None:
+            limit = first_slip_ms, FIRST_SLIP
+        panels.append(Panel(label, values, colour, zero, notes, LEAST[time], limit))
     svg = by_condition(list(groups), panels, simulated=simulated, breaks=breaks)
     trials = [(row, trial) for row, found in groups.items() for trial in found]
     data: dict[str, list[object]] = {

@@ -108,7 +108,7 @@ def make_sections(sources: Sources, summary: Summary) -> list[Content | Rendered
         clocks.clock_section(campaigns, summary.sync, page=page, simulated=simulated),
         windows.lead_section(kinematic, simulated=simulated),
         windows.work_section(kinematic),
-        detector_section(summary.detectors, simulated=simulated),
+        detector_section(summary.detectors, kinematic.first_slip_ms, simulated=simulated),
         onset_section(summary),
         *plugin_sections(data, last=True),
         paper_section(summary),

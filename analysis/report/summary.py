@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from pydantic_core import to_jsonable_python
@@ -32,6 +33,7 @@ from sliplab.storage.schema.evaluation import (
     Evaluation,
     OtherEvaluation,
     TrainedBaseline,
+    TrialScore,
     WindowIntervals,
 )
 from sliplab.storage.schema.holdout import HoldoutResult
@@ -191,8 +193,22 @@ def _judged(
             "accounted": account(campaigns, ours, name),
             "intervals": trial_intervals(ours, evaluation.detection.values()),
             "by_reference": judge_by_reference(decided),
+            "first_slip_ms": first_slip_ms(rows, references),
         }
     return found
+
+
+def first_slip_ms(rows: Sequence[TrialScore], references: Slips) -> float | None:
+    """Return the median time from the labelled onset to the true one, which nothing comes before.
+
+    Only simulated trials have it.
+    """
+    found = []
+    for row in rows:
+        true = references.get((row.campaign, row.trial), {}).get("true")
+        if true is not None and row.incipient_ns is not None:
+            found.append((true.slip.incipient_ns - row.incipient_ns) / 1e6)
+    return median(found) if found else None
 
 
 def _network(

@@ -196,7 +196,7 @@ def whole_recordings(counts: I64, y: I64, trial: I64) -> tuple[I64, I64, I64]:
 def _whole(counts: I64, y: I64, trial: I64) -> TrialAccuracy:
     sums, true, of = whole_recordings(counts, y, trial)
     return TrialAccuracy(
-        argmax=window_groups.share(window_groups.credit(sums, true), of),
+        argmax=window_groups.share(metrics.credit(sums, true), of),
         strict=window_groups.share(window_groups.strict_hits(sums, true), of),
     )
 
@@ -260,7 +260,7 @@ def by_length(fitted: Fitted, test: SampleSet) -> tuple[LengthShare, ...]:
     for n in steps:
         seen = windows.model_copy(update={"length_ms": n * windows.step_ms})
         counts = training.predict_counts(replace(fitted, windows=seen), test.windows.first_steps(n))
-        found = window_groups.share(window_groups.credit(counts, test.y), test.trial)
+        found = window_groups.share(metrics.credit(counts, test.y), test.trial)
         rows.append(LengthShare(ms=seen.length_ms, **dict(found)))
     return tuple(rows)
 

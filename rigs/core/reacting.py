@@ -20,11 +20,10 @@ from typing import Literal, Protocol
 from sliplab.protocols.program import ACTING, Move, Position, Program, Step, Twist
 from sliplab.rigs.core.capabilities import ArmFault, RigError, StaysInContact
 from sliplab.rigs.core.force_watch import PressPlaces
+from sliplab.rigs.core.motion_watch import REST_LIMIT_S
 from sliplab.rigs.core.rig import Rig, arm_fault, nuisances_of
 from sliplab.storage.streams import Sink
 
-REST_S = 2.0
-"""Timeout for a stopped arm to come to rest, s."""
 GRIPPER = "gripper"
 _LEVEL = ("slide", "retract", "twist")
 """Phases in which the arm gets no deeper."""
@@ -290,8 +289,8 @@ def _react(
         command_ms = passed_ms()
     watcher.step("reflex", False)
     while not (progress := rig.arm.progress()).done:
-        if passed_ms() > REST_S * 1e3:
-            raise ArmFault("arm", f"is still moving {REST_S:g} s after the stop command")
+        if passed_ms() > REST_LIMIT_S * 1e3:
+            raise ArmFault("arm", f"is still moving {REST_LIMIT_S:g} s after the stop command")
         rig.wait(min(rig.poll_s, 0.002))
     if not progress.state.healthy:
         raise arm_fault(progress.state, phase)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sliplab.protocols.hashing import hash_integer
-from sliplab.protocols.maintenance import MAX_CREEP_MM_S, Rezero
+from sliplab.protocols.maintenance import Rezero
 from sliplab.protocols.program import Move, Position
+from sliplab.protocols.protocol_limits import MAX_CREEP_MM_S
 from sliplab.rigs.core.capabilities import ArmFault, RigError, Segment
 from sliplab.rigs.core.rig import (
     MOVE_GRACE_S,

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.protocols.maintenance import MAX_CREEP_MM_S
 from sliplab.protocols.program import Move, Position
+from sliplab.protocols.protocol_limits import MAX_CREEP_MM_S
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.core.host_clock import OR_BUSY, StallTimer
 from sliplab.rigs.core.pulse_code import SEEDS

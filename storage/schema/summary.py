@@ -103,6 +103,9 @@ class Experiment(ExperimentScores):
     intervals: TrialIntervals
     by_reference: dict[str, OnsetFigures] = Field(default_factory=dict)
     """By `paper`, `change_point` and, only where simulated, `true`."""
+    first_slip_ms: Known = None
+    """When the first tip slips, from the labelled onset, median over trials; only where
+    simulated."""
 
 
 class NetworkWindows(Experiment):

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 
 from sliplab.analysis.report.figures.style import (
     BLUE,
+    FIRST_SLIP,
     GREEN,
     GREY,
     ORANGE,
@@ -34,12 +35,15 @@ _LINES = (
 Curve = Sequence[tuple[float, float | None]]
 
 
-def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: bool) -> str:
+def latency_over_rate(
+    panels: Mapping[str, Mapping[str, Curve]], first_slip_ms: float | None, *, simulated: bool
+) -> str:
     """A panel for each stride, a line for each detector, as SVG.
 
     Args:
         panels: title to name to points: false early rate 0..1 and median latency in ms, None
             where more than half of the onsets were missed.
+        first_slip_ms: when the first tip slips, median, from the onset; None where not known.
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(panels), figsize=(6.4, 4.0), sharey=True, squeeze=False)
@@ -61,7 +65,10 @@ def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: b
                 )
             axes.set_title(title)
             axes.set_xlabel("false early, validation trials (%)")
-            axes.set_ylim(bottom=0)
+            if first_slip_ms is None:
+                axes.set_ylim(bottom=0)
+            else:
+                axes.axhline(first_slip_ms, color=GREY, lw=1.0, ls=":", label=FIRST_SLIP)
             axes.set_xlim(-0.05 * most, 1.05 * most)
         grid[0][0].set_ylabel("median incipient latency,\ntest trials (ms)")
         handles, names = grid[0][0].get_legend_handles_labels()

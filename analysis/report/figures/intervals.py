@@ -29,6 +29,7 @@ class Panel:
         colour: of its dots.
         zero: the meaning of zero, as text; empty where zero has none.
         least: the smallest value that there can be.
+        limit: a value that none can be below, as it is known of the scene, and its meaning.
         notes: by row, what to write at its right end, such as how many have no value.
     """
 
@@ -38,6 +39,7 @@ class Panel:
     zero: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
     least: float = -np.inf
+    limit: tuple[float, str] | None = None
 
 
 def by_condition(
@@ -79,9 +81,14 @@ def by_condition(
                     )
             for place in breaks:
                 axes.axhline(place - 0.5, color=GREY, lw=0.4)
+            lines = []
             if panel.zero:
                 axes.axvline(0, color=GREY, lw=0.8)
-                axes.set_title(f"0: {panel.zero}", fontsize=7.5, color=GREY)
+                lines.append(f"0: {panel.zero}")
+            if panel.limit is not None:
+                axes.axvline(panel.limit[0], color=GREY, lw=1.0, ls=":")
+                lines.append(f"dotted: {panel.limit[1]}")
+            axes.set_title("\n".join(lines), fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)
             axes.set_xlim(*_room(panel))
@@ -105,6 +112,7 @@ def _room(panel: Panel) -> tuple[float, float]:
     """Limits of a panel: all trials; the wide interval of a few trials is cut off."""
     shown = [value for values in panel.values.values() for value in values]
     shown += [0.0] if panel.zero else []
+    shown += [] if panel.limit is None else [panel.limit[0]]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
     margin = 0.06 * (high - low) or 1.0
     return low - margin, high + margin

@@ -36,6 +36,8 @@ WIDTH = 6.4
 """Inches: still readable when a telephone shrinks it."""
 _DPI = 150
 """Resolution of rasterised parts."""
+FIRST_SLIP = "first tip slips (true)"
+"""Name of the line that no detection can be below."""
 STYLE = {
     "font.size": 9,
     "font.family": "DejaVu Sans",

@@ -81,7 +81,7 @@ def routes(web: Web) -> list[BaseRoute]:
     async def trial(request: Request) -> Response:
         def read() -> Response:
             found, texts = reviews.trial(**request.path_params)
-            html = web.html(request, "review_trial.html", **texts)
+            html = web.html(request, "review_label.html", **texts)
             return JSONResponse({**found, "html": html})
 
         return await answered(read)

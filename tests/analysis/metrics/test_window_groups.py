@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.metrics import window_groups
-from sliplab.analysis.metrics.classification import accuracy
+from sliplab.analysis.metrics.classification import accuracy, credit
 from sliplab.analysis.metrics.intervals import share_interval
-from sliplab.analysis.metrics.window_groups import by_factor, by_tenth, credit, share, strict_hits
+from sliplab.analysis.metrics.window_groups import by_factor, by_tenth, share, strict_hits
 
 COUNTS = np.array([[5, 0, 0], [3, 3, 0], [0, 0, 0], [0, 2, 1], [0, 0, 4], [9, 0, 0]])
 LABELS = np.array([0, 1, 2, 1, 2, 2])

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
+
 from sliplab.analysis.detectors import onset_references
 from sliplab.analysis.detectors.latency import DetectedOnsets, TrueSlip
-from sliplab.analysis.detectors.onset_references import Decided, Name, OnsetReference
+from sliplab.analysis.detectors.onset_references import Decided, Name, OnsetReference, References
 from sliplab.analysis.report.onsets import Explained, OnsetSection, onset_section
 from sliplab.analysis.report.page import render_section
+from sliplab.analysis.report.summary import first_slip_ms
 from sliplab.storage.schema import evaluation
 from sliplab.storage.schema.evaluation import DetectorComparison, DetectorRate, OnsetFigures
 from sliplab.storage.schema.summary import Kinematic, NetworkSummary, Summary
@@ -36,6 +39,31 @@ def figures(
             for at in incipient_ms
         ]
     )
+
+
+@pytest.mark.parametrize(
+    ("labelled_ms", "true_ms", "found"),
+    [
+        ([1000, 1000, 1000], [901, 880, 950], -99.0),
+        ([1000, None, 1000], [901, 880, None], -99.0),  # without a label, and of a real trial
+        ([1000], [None], None),
+    ],
+)
+def test_the_first_slip_is_the_median_of_the_truth_from_the_label(
+    labelled_ms: list[int | None], true_ms: list[int | None], found: float | None
+) -> None:
+    rows = [
+        evaluation.TrialScore.model_construct(
+            campaign="c", trial=str(k), incipient_ns=None if at is None else at * MS
+        )
+        for k, at in enumerate(labelled_ms)
+    ]
+    slips: dict[tuple[str, str], References] = {
+        ("c", str(k)): {"true": OnsetReference(TrueSlip(at * MS, 1401 * MS, 1800 * MS))}
+        for k, at in enumerate(true_ms)
+        if at is not None
+    }
+    assert first_slip_ms(rows, slips) == found
 
 
 def summary(

@@ -14,6 +14,7 @@ import pytest
 
 from sliplab.analysis.report.cover import Answer, Cover
 from sliplab.analysis.report.figures import campaign, clocks, intervals, trials
+from sliplab.analysis.report.figures.detectors import latency_over_rate
 from sliplab.analysis.report.figures.intervals import (
     Panel,
     ShareInterval,
@@ -36,6 +37,7 @@ LEAD = Panel(
     {ROWS[0]: [360.0, 420.0]},
     zero="gross slip",
     notes={ROWS[0]: "2 missed"},
+    limit=(-120.0, "first tip slips (true)"),
 )
 DEPTHS = [ShareInterval("2.4 mm", 0.9, 0.85, 0.95), ShareInterval("2.6 mm", None, None, None)]
 POINTS = [
@@ -46,7 +48,11 @@ WINDOWS = "windows classified correctly (%)"
 DRAWN: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "by_condition": (
         partial(by_condition, ROWS, [LEAD], breaks=[1]),
-        ("lead (ms)", *ROWS, "0: gross slip", "2 missed", "none"),
+        ("lead (ms)", *ROWS, "0: gross slip", "dotted: first tip", "2 missed", "none"),
+    ),
+    "latency_over_rate": (
+        partial(latency_over_rate, {"every 10 ms": {"CUSUM": [(0.0, 40.0), (0.1, None)]}}, -120.0),
+        ("every 10 ms", "CUSUM", "first tip slips (true)", "−100"),
     ),
     "shares": (
         partial(intervals.shares, {"depth": DEPTHS}, WINDOWS, line=(0.92, "all")),
