@@ -26,7 +26,7 @@ def feed(detector: Detector, scene: Scene, edges_us: Sequence[int] | None = None
     detector.begin(scene.width, scene.height)
     return Evidence.joined(
         [
-            checked_of(scene, detector.push(events, until_us), before_us, until_us)
+            _pushed(detector, scene, events, before_us, until_us)
             for events, before_us, until_us in chunks(scene, edges_us or steady(scene, CHUNK_US))
         ]
     )
@@ -46,9 +46,11 @@ def chunks(scene: Scene, edges_us: Sequence[int]) -> Iterator[tuple[EventChunk, 
         yield every[cuts[k] : cuts[k + 1]], before_us, until_us
 
 
-def checked_of(scene: Scene, found: Evidence, before_us: int, until_us: int) -> Evidence:
+def _pushed(
+    detector: Detector, scene: Scene, events: EventChunk, before_us: int, until_us: int
+) -> Evidence:
     """Return evidence that keeps the rules. Raises DetectorError, which names the scene."""
     try:
-        return checked(found, before_us, until_us)
+        return checked(detector.push(events, until_us), before_us, until_us)
     except DetectorError as error:
         raise DetectorError(f"{scene.name}: {error}") from None

@@ -44,6 +44,11 @@ def is_known(name: str) -> bool:
     return ":" in name or name.endswith((ONNX, SUFFIX)) or name in known()
 
 
+def is_shipped(name: str) -> bool:
+    """Return whether a name is that of a detector of this package, not of another one's code."""
+    return known().get(name, "").startswith("sliplab.")
+
+
 def contents(name: str) -> list[str]:
     """Return hashes of the files that a detector's name names: its module, model or program."""
     if name.startswith(PROGRAM):

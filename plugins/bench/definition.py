@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 VERSION = 2
+SEEDS = 2**53
+"""Seeds of test worlds are below; so many that a detector cannot try all while it is judged."""
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ class BenchPoint(Part):
     Attributes:
         asked: false alarms an hour. allowed: those of all validation scenes at the level.
         level: None where nothing bounds it.
-        promised: the upper end of the validation scenes' rate is at most `asked`; None in older
-            results. If not, their hours were too few.
+        promised: the upper end of the validation scenes' rate is at most `asked`, and the lower
+            end of the test scenes' is not above it; None in older results.
     """
 
     asked: Number
@@ -88,17 +88,18 @@ class KeptDetector(Document):
 
     row: BenchDetector
     hours: dict[str, Number]
+    alone: Bool
 
 
 class LimitPoint(Part):
-    """How soon an observer that knows the scene is certain, at so many false alarms an hour."""
+    """How soon Page's test on the slipping marker is certain, at so many false alarms an hour."""
 
     asked: Number
     latency_ms: MedianLatency
 
 
 class BenchLimit(Document):
-    """The limit of the bench's test slides, see `plugins.bench.limit`."""
+    """Page's test on the slipping marker in the test slides, see `plugins.bench.limit`."""
 
     slides: Int
     points: tuple[LimitPoint, ...]
@@ -112,7 +113,8 @@ class BenchResult(Document):
         worlds: which set of effects; `usual` in older results.
         scenes: their number by part. hours: without slip, of validation and test scenes.
         detectors: the best first.
-        limit: what an observer that knows the scene would need; None in older results.
+        limit: what Page's test on the slipping marker needs; None in older results.
+        alone: detectors saw no process but their own; None in older results.
     """
 
     simulated: Bool
@@ -124,6 +126,7 @@ class BenchResult(Document):
     hours: dict[str, Number]
     detectors: tuple[BenchDetector, ...]
     limit: BenchLimit | None = None
+    alone: Bool | None = None
 
     @property
     def command(self) -> str:

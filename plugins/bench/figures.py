@@ -34,13 +34,21 @@ RATES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 
 
 def tested(scenes: Sequence[SceneEvidence], levels: Sequence[Level]) -> tuple[BenchPoint, ...]:
-    """Return the scores of test scenes at levels that are set already."""
+    """Return the scores of test scenes at levels that are set already.
+
+    Test scenes can refute a promise: validation scenes are known to all, and may be remembered.
+    """
+
+    def kept(level: Level) -> bool:
+        low = false_alarm_rate(scenes, level.value).low
+        return level.promised and (low is None or low <= level.asked)
+
     return tuple(
         BenchPoint(
             asked=level.asked,
             allowed=level.found.alarms,
             level=float(level.value) if np.isfinite(level.value) else None,
-            promised=level.promised,
+            promised=kept(level),
             test=scores(scenes, level.value),
         )
         for level in levels

@@ -1,4 +1,4 @@
-"""The limit of the bench: how soon an observer that knows the scene would know of its first slip.
+"""A reference for latencies: Page's test on the marker that slips first, its event rates known.
 
 It knows which tip slips, and the rates of events around its marker, each millisecond, with the slip
 and without it. Both are means over `DRAWN` simulations of the camera; without the slip the tip goes
@@ -6,8 +6,9 @@ on to be loaded as before. Events are taken as Poisson. The observer sums the lo
 likelihood ratio, as Page's test does, and is certain at ``ln(steps between false alarms)``: its
 mean time to a false alarm is then at least as long (Lorden 1971, theorem 2).
 
-It expects the slip at any moment. A detector that was trained knows that slip comes while markers
-move, which is a small part of the time, and can be certain earlier.
+It is no lower bound. It expects the slip at any moment and sees one marker; a detector that sees
+all of them, and knows that slip comes while they move, can be certain earlier. Lorden's bound makes
+its level higher than the asked rate needs.
 """
 
 from __future__ import annotations

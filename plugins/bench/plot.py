@@ -23,7 +23,7 @@ def latency_against_alarms(found: BenchResult) -> str:
     """Return a curve for each detector that detects half of the slips, as SVG.
 
     Each point is a level that validation scenes set to an asked rate; the rate that test scenes
-    showed is drawn. The first point, filled, is the table's. A dotted line is the limit.
+    showed is drawn. The first point, filled, is the table's. Dotted: see `limit`.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(WIDTH, 3.9))
@@ -57,7 +57,7 @@ def latency_against_alarms(found: BenchResult) -> str:
             (point.asked, late) for point in limit if (late := point.latency_ms.value) is not None
         ]
         if known:
-            axes.plot(*zip(*known, strict=True), "k:", lw=1.2, label="scene known")
+            axes.plot(*zip(*known, strict=True), "k:", lw=1.2, label="one marker")
             drawn += 1
         axes.set_xscale("log")
         axes.set_yscale("log")

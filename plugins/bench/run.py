@@ -2,7 +2,9 @@
 
 Each detector runs in a process of its own, which is given events chunk by chunk. All choices are
 made by `prepare`, which has no test scene. A detector's figures are stored as soon as they are
-complete, so that a stopped run resumes with the next detector.
+complete, so that a stopped run of a given seed resumes with the next detector. A seed that is drawn
+is in memory alone until the run ends: only detectors that nobody could fit to its worlds are judged
+on them.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from multiprocessing import active_children
@@ -26,13 +29,13 @@ from sliplab.analysis.detectors.alarms import (
     promised_levels,
 )
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
-from sliplab.analysis.detectors.feeding import feed
-from sliplab.analysis.detectors.registry import contents, make_detector
+from sliplab.analysis.detectors.feeding import CHUNK_US, feed, steady
+from sliplab.analysis.detectors.registry import contents, is_shipped, make_detector
 from sliplab.flows.running import console, stopping
 from sliplab.plugins.bench import scenes
-from sliplab.plugins.bench.apart import ApartDetector
-from sliplab.plugins.bench.audit import audit, drawn_edges
-from sliplab.plugins.bench.definition import SIZES, VERSION, WORLDS, Size
+from sliplab.plugins.bench.apart import ApartDetector, alone
+from sliplab.plugins.bench.audit import FINE_US, audit, drawn_edges
+from sliplab.plugins.bench.definition import SEEDS, SIZES, VERSION, WORLDS, Size
 from sliplab.plugins.bench.document import (
     BenchDetector,
     BenchLimit,
@@ -59,8 +62,8 @@ from sliplab.storage.process import give_memory_back, out_of_reach
 from sliplab.storage.spawn_context import WORKERS
 from sliplab.storage.trials.derived import Derived, make_key
 
-ENTRIES_VERSION = 3
-"""Incremented when a shipped detector has other figures or intervals on the same scenes."""
+ENTRIES_VERSION = 4
+"""Incremented when figures or intervals on the same scenes may differ, or rules are stricter."""
 LIMIT_VERSION = 1
 AUDITED = 24
 """Slides of the test in which causality is checked."""
@@ -108,17 +111,13 @@ def prepare(detector: ApartDetector, training: TrainingScenes, advance: Advance)
 
 
 def judged(
-    detector: Detector, given: Sequence[Scene], advance: Advance, seed: int | None = None
+    detector: Detector, given: Sequence[Scene], advance: Advance, chunk_us: int = CHUNK_US
 ) -> list[SceneEvidence]:
-    """Return a detector's evidence on scenes.
-
-    Args:
-        seed: draws the chunks in which events are given; without one each has a second.
-    """
+    """Return a detector's evidence on scenes, whose events it is given in chunks of one length."""
     found = []
-    for place, scene in enumerate(given):
-        edges = None if seed is None else drawn_edges(scene, hash_integer("chunks", seed, place))
-        found.append(SceneEvidence(feed(detector, scene, edges), scene.slip, scene.world))
+    for scene in given:
+        evidence = feed(detector, scene, steady(scene, chunk_us))
+        found.append(SceneEvidence(evidence, scene.slip, scene.world))
         advance()
     return found
 
@@ -128,21 +127,27 @@ def measure(
 ) -> BenchDetector:
     """Return the figures of a detector on test scenes.
 
+    Evidence counts as it answered to the shortest chunks, the first time that it saw a scene: none
+    rests on what came later than `FINE_US`, whatever the detector remembers.
+
     Raises:
         DetectorError: its evidence is invalid, or rests on later events.
     """
     detector, levels = prepared.detector, prepared.levels
-    found = judged(detector, tests.scenes, advance, seed)
+    slides = [scene for scene in tests.scenes if scene.end_us < LONG_US]
+    detector.decisions_us.clear()
+    found = judged(detector, slides, advance, FINE_US)
+    decision_us = float(np.median(detector.decisions_us or [0.0]))
+    found += judged(detector, tests.scenes[len(slides) :], advance, FINE_US)  # long holds
     disturbed = {
-        nuisance: judged(detector, given, advance, hash_integer(nuisance, seed))
+        nuisance: judged(detector, given, advance, FINE_US)
         for nuisance, given in tests.nuisances.items()
     }
-    slides = [place for place, scene in enumerate(tests.scenes) if scene.end_us < LONG_US]
-    chosen = np.random.default_rng(seed).permutation(slides)[:AUDITED]
-    detector.decisions_us.clear()
+    chosen = np.random.default_rng(seed).permutation(len(slides))[:AUDITED]
     for place in chosen.tolist():
-        expected = found[place].evidence
-        audit(detector, tests.scenes[place], expected, [level.value for level in levels])
+        scene, expected = slides[place], found[place].evidence
+        edges = drawn_edges(scene, hash_integer("chunks", seed, place))
+        audit(detector, scene, edges, expected, [level.value for level in levels])
     cost = detector.cost()
     return BenchDetector(
         name=name,
@@ -152,7 +157,7 @@ def measure(
         accuracy=accuracy(found),
         operations=cost.operations,
         memory_bytes=cost.memory_bytes,
-        decision_us=float(np.median(detector.decisions_us or [0.0])),
+        decision_us=decision_us,
         train_s=prepared.train_s,
     )
 
@@ -259,7 +264,7 @@ def _judge(job: DetectorJob, advance: Advance | None = None) -> KeptDetector:
     finally:
         if detector is not None:
             detector.close()
-    return KeptDetector(row=row, hours=bench.hours)
+    return KeptDetector(row=row, hours=bench.hours, alone=bool(alone()))
 
 
 def _judge_each(
@@ -295,7 +300,7 @@ def _judge_each(
 
 
 def find_limit(size: Size, seed: int, worlds: str = "usual") -> BenchLimit:
-    """Return what an observer that knows the scenes would need, over the test slides."""
+    """Return what Page's test on the slipping marker needs, over the test slides."""
     drawn = [it for it in scenes.test_scenes(size, seed, worlds) if it.hold_s * 1e6 < LONG_US]
     waits = []
     with console.bar("limit (slides, simulated)", len(drawn)) as bar:
@@ -312,20 +317,34 @@ def find_limit(size: Size, seed: int, worlds: str = "usual") -> BenchLimit:
     )
 
 
-def _drawn_seed(folder: Path) -> int:
-    """Return the seed of a folder's test worlds, which is drawn once.
+def _published_seed(folder: Path) -> int | None:
+    """Return the seed that a folder's last run drew; None where none did.
 
     Raises:
         InputError: the file of the seed does not have one.
     """
     path = folder / SEED_FILE
     if not path.exists():
-        make_folder(folder)
-        write_text(path, json.dumps({"seed": secrets.randbelow(2**31)}) + "\n")
+        return None
     found = read_json(path).get("seed")
-    if not isinstance(found, int):
-        raise InputError(str(path), "seed", found, "must be a whole number")
+    if type(found) is not int or not 0 <= found < SEEDS:
+        raise InputError(str(path), "seed", found, f"must be a whole number from 0 to {SEEDS - 1}")
     return found
+
+
+def _contents(name: str) -> object:
+    """Return what changes with a detector's files; wrong input fails here, before all simulation.
+
+    Nothing of a detector that does not ship runs in this process.
+    """
+    if is_shipped(name):
+        make_detector(name).close()
+        return contents(name)
+    try:
+        with closing(ApartDetector(name)) as detector:
+            return detector.contents
+    except DetectorError as error:
+        raise InputError("DETECTOR", "", name, str(error)) from None
 
 
 def run_bench(
@@ -340,7 +359,8 @@ def run_bench(
 
     Args:
         names: of detectors, see `registry`. size: one of `SIZES`.
-        seed: of the test worlds; None: that of the folder, and drawn where it has none.
+        seed: of the test worlds; None: that which the folder's last run drew if all have results
+            with it, and else drawn, for all of them.
         folder: keeps what a detector gave.
         workers: processes at the most; each simulates the scenes for itself.
         worlds: one of `WORLDS`.
@@ -354,30 +374,49 @@ def run_bench(
     twice = next((name for name in names if list(names).count(name) > 1), None)
     if twice is not None:
         raise InputError("DETECTOR", "", twice, "must be named once")
-    for name in names:
-        make_detector(name).close()  # wrong input fails before anything is simulated
     if worlds not in WORLDS:
         raise InputError("--worlds", "", worlds, f"must be one of {', '.join(WORLDS)}")
+    hashes = {name: _contents(name) for name in names}
     saved = Derived(folder / "detectors")
+
+    def keys_of(seed: int) -> dict[str, str]:
+        # the usual worlds keep the key that they had before there were others
+        of_scenes = [ENTRIES_VERSION, size, seed, *([] if worlds == "usual" else [worlds])]
+        return {name: make_key("bench", VERSION, [name, hashes[name]], of_scenes) for name in names}
+
+    def kept(seed: int) -> dict[str, KeptDetector]:
+        return {
+            name: saved.load(key[:16], KeptDetector)
+            for name, key in keys_of(seed).items()
+            if saved.fresh(key[:16], key)
+        }
+
+    drawn = seed is None
     if seed is None:
-        seed = _drawn_seed(folder)
-    # the usual worlds keep the key that they had before there were others
-    scene_key = [ENTRIES_VERSION, size, seed, *([] if worlds == "usual" else [worlds])]
-    keys = {name: make_key("bench", VERSION, [name, contents(name)], scene_key) for name in names}
+        seed = _published_seed(folder)
+        if seed is None or len(kept(seed)) < len(names):
+            seed = secrets.randbelow(SEEDS)
+    keys, found = keys_of(seed), kept(seed)
 
-    def keep(found: KeptDetector) -> None:
-        key = keys[found.row.name]
-        saved.write(key[:16], key, found)
+    def keep(one: KeptDetector) -> None:
+        key = keys[one.row.name]
+        saved.write(key[:16], key, one)
+        found[one.row.name] = one  # not read again: a later detector may have changed the file
 
-    missing = [name for name, key in keys.items() if not saved.fresh(key[:16], key)]
-    if missing:
-        jobs = [DetectorJob(name, SIZES[size], seed, worlds) for name in missing]
-        _judge_each(jobs, workers, keep)
+    try:
+        missing = [name for name in names if name not in found]
+        if missing:
+            jobs = [DetectorJob(name, SIZES[size], seed, worlds) for name in missing]
+            _judge_each(jobs, workers, keep)
+    finally:
+        if drawn:
+            make_folder(folder)
+            write_text(folder / SEED_FILE, json.dumps({"seed": seed}) + "\n")
     limit = Derived(folder / "limits")
     of_scenes = make_key("limit of the bench", VERSION, [worlds], [LIMIT_VERSION, size, seed])
     if not limit.fresh(of_scenes[:16], of_scenes):
         limit.write(of_scenes[:16], of_scenes, find_limit(SIZES[size], seed, worlds))
-    found = [saved.load(key[:16], KeptDetector) for key in keys.values()]
+    rows = [found[name] for name in names]
     return BenchResult(
         simulated=True,
         version=VERSION,
@@ -385,7 +424,8 @@ def run_bench(
         seed=seed,
         worlds=worlds,
         scenes=BenchScenes(SIZES[size], seed).counts,
-        hours=found[0].hours,
-        detectors=tuple(ranked([one.row for one in found])),
+        hours=rows[0].hours,
+        alone=all(one.alone for one in rows),
+        detectors=tuple(ranked([one.row for one in rows])),
         limit=limit.load(of_scenes[:16], BenchLimit),
     )

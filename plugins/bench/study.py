@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sliplab.analysis.study import Finding, Study
+from sliplab.plugins.bench.definition import SEEDS
 from sliplab.plugins.bench.document import BenchDetector, BenchResult, MedianLatency
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.shown import plural
@@ -34,6 +35,7 @@ COLUMNS = (
 )
 COSTS = 7
 """Column of the first cost; on a page costs have a table of their own."""
+PAGE_TEST = "Page's test on the slipping marker alone, which expects slip at any moment,"
 BEGIN, END = "<!-- bench: written by `sliplab bench` -->", "<!-- bench: end -->"
 
 
@@ -49,7 +51,7 @@ def measure(
     seed: Annotated[
         int | None,
         typer.Option(
-            "--seed", min=0, max=2**31, help="Of the test worlds; default: drawn, and printed."
+            "--seed", min=0, max=SEEDS - 1, help="Of the test worlds; default: drawn, and printed."
         ),
     ] = None,
     small: Annotated[bool, typer.Option("--small", help="Fewer scenes, for a first look.")] = False,
@@ -128,7 +130,9 @@ def _interval_note(found: BenchResult) -> str:
     text = f"{text}; {few}." if few else f"{text}."
     if found.limit is not None:
         known = _median(found.limit.points[0].latency_ms).replace(" (", " ms (")
-        text += f" An observer that knows the scene would need {known}."
+        text += f" {PAGE_TEST} needs {known}."
+    if found.alone is False:
+        text += " This system let detectors see other processes."
     return text
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
@@ -29,6 +30,8 @@ from sliplab.storage.spawn_context import refuse_main
 T = TypeVar("T")
 KILL_S = 2.0
 """Timeout for a child to end after a request or a kill, s."""
+ANSWER_BYTES = 1 << 30
+"""Largest answer: a child cannot fill the parent's memory."""
 _OUTPUT_BYTES = 2000
 _OUTPUT_CHARACTERS = 160
 
@@ -61,6 +64,7 @@ class PipeCalls:
         kill: ends the child at once, in any thread.
         pending: answers that the child sends without a call, to be read by `answer`.
         ignore_suspend: time for which this computer was suspended is not counted.
+        decode: returns an answer of its bytes; raises for others.
     """
 
     def __init__(
@@ -70,8 +74,9 @@ class PipeCalls:
         *,
         pending: int = 0,
         ignore_suspend: bool = False,
+        decode: Callable[[bytes], tuple[bool, Any]] = pickle.loads,
     ) -> None:
-        self.pipe = pipe
+        self.pipe, self._decode = pipe, decode
         self._kill, self._pending, self._ignore_suspend = kill, pending, ignore_suspend
         self._lock = threading.Lock()
         self._count = 0
@@ -137,7 +142,7 @@ class PipeCalls:
             self._count += 1
             self._reading = self._count, left_s
             try:
-                found = self.pipe.recv()
+                found = self._decode(self.pipe.recv_bytes(ANSWER_BYTES))
             except BaseException:  # Ctrl-C too: the rest of the message would begin the next one
                 self._kill()
                 if self._late:
@@ -184,6 +189,8 @@ class LibraryProcess:
         start_s: timeout for the child to start, s.
         error: exception class to raise.
         ignore_suspend: timeouts do not count time for which this computer was suspended.
+        decode: as `PipeCalls`; a pickle, the default, can run code in this process.
+        within: command that runs the child, such as `unshare`; ends with it.
 
     Raises:
         LibraryError: it was not ready within `start_s`; the child has been killed.
@@ -199,6 +206,8 @@ class LibraryProcess:
         error: type[LibraryError] = LibraryError,
         *,
         ignore_suspend: bool = False,
+        decode: Callable[[bytes], tuple[bool, Any]] = pickle.loads,
+        within: Sequence[str] = (),
     ) -> None:
         module, function = serve.split(":")
         refuse_main(module, function)
@@ -214,7 +223,7 @@ class LibraryProcess:
         )
         with theirs:
             self._child = Child(
-                [sys.executable, "-c", code],
+                [*within, sys.executable, "-c", code],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
@@ -225,6 +234,7 @@ class LibraryProcess:
             partial(self._child.stop, KILL_S, at_once=True),
             pending=1,
             ignore_suspend=ignore_suspend,
+            decode=decode,
         )
         try:
             self.begun: Any = self._result("connect", lambda: self._calls.answer(start_s))

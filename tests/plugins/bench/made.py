@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -63,6 +64,7 @@ class InThisProcess(Detector):
     def __init__(self, name: str) -> None:
         self.decisions_us: list[float] = []
         self.detector = make_detector(name)
+        self.contents = ""
 
     def train(self, scenes: Sequence[Scene], validation: Sequence[Scene]) -> None:
         self.detector.train(scenes, validation)
@@ -107,6 +109,57 @@ class Broken(Detector):
 
     def push(self, events: EventChunk, until_us: int) -> Evidence:
         return 3  # type: ignore[return-value]
+
+
+class Late(Counting):
+    """Evidence: events of the 10 ms that ended 50 ms before."""
+
+    def begin(self, width: int, height: int) -> None:
+        super().begin(width, height)
+        self._line = np.zeros(5)
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        found = super().push(events, until_us)
+        line = np.concatenate([self._line, found.value])
+        self._line = line[len(found) :]
+        return Evidence.of(found.t_us, line[: len(found)])
+
+
+class Remembers(Late):
+    """Dates its evidence back where a chunk is long, and repeats itself on a known scene."""
+
+    def __init__(self) -> None:
+        self._answers: dict[tuple[int, ...], dict[int, float]] = {}
+
+    def begin(self, width: int, height: int) -> None:
+        super().begin(width, height)
+        self._first: list[int] = []
+        self._known: dict[int, float] = {}
+
+    def push(self, events: EventChunk, until_us: int) -> Evidence:
+        found = super().push(events, until_us)
+        if len(self._first) < 10:
+            self._first += events.t_us[: 10 - len(self._first)].tolist()
+            self._known = self._answers.setdefault(tuple(self._first), {})
+        value = [
+            self._known.setdefault(t, found.value[k : k + 5].max())
+            for k, t in enumerate(found.t_us.tolist())
+        ]
+        return Evidence.of(found.t_us, value)
+
+
+class Neighbours(Counting):
+    """States how many processes it sees."""
+
+    def cost(self) -> Cost:
+        return Cost(sum(name.isdigit() for name in os.listdir("/proc")))
+
+
+class Strange(Counting):
+    """States a cost that is none."""
+
+    def cost(self) -> Cost:
+        return Cost(float("nan"))
 
 
 class Snoops(Counting):

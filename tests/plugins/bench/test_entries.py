@@ -19,7 +19,7 @@ from sliplab.analysis.detectors.registry import contents, known, make_detector
 from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.metrics.classification import INCIPIENT
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.plugins.bench.audit import audit
+from sliplab.plugins.bench.audit import audit, drawn_edges
 from sliplab.plugins.bench.entries.hyperdimensional import Hyperdimensional
 from sliplab.plugins.bench.entries.network import PaperEntry
 from sliplab.plugins.bench.entries.onnx_model import OnnxModel
@@ -51,7 +51,7 @@ def test_a_program_gives_the_evidence_of_the_same_detector_in_python(one: Scene)
             expected, found = feed(Counting(), one), feed(detector, one)
             assert np.array_equal(found.t_us, expected.t_us)
             assert np.array_equal(found.value, expected.value)
-        audit(detector, one, feed(detector, one), [1.0])
+        audit(detector, one, drawn_edges(one, 1), feed(detector, one), [1.0])
     finally:
         detector.close()
 
@@ -209,7 +209,7 @@ def test_an_onnx_file_of_one_output_gives_evidence(one: Scene, tmp_path: Path) -
 
 def test_an_onnx_file_of_three_outputs_gives_classes(one: Scene, tmp_path: Path) -> None:
     detector = OnnxModel(onnx_file(tmp_path / "c.onnx", 3, ["n", 30, 1, 20, 20], gain="100"))
-    found = audit(detector, one, feed(detector, one), [0.0])
+    found = audit(detector, one, drawn_edges(one, 1), feed(detector, one), [0.0])
     assert found.t_us[:2].tolist() == [30_000, 40_000]
     after = found.t_us > one.slip.physical_us + 100_000
     assert found.value[after].min() > found.value[~after].max() - 1.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.detectors.detector import Detector, DetectorError, Evidence, Scene
-from sliplab.analysis.detectors.feeding import feed
-from sliplab.plugins.bench.audit import COARSE_US, audit, drawn_edges
+from sliplab.analysis.detectors.feeding import feed, steady
+from sliplab.plugins.bench.audit import COARSE_US, FINE_US, audit, drawn_edges
 from sliplab.storage.streams import EventChunk
 from tests.plugins.bench.made import Counting, scene
 
@@ -72,15 +72,15 @@ class HidesIt(LooksAhead):
 
 @pytest.mark.parametrize("detector", [LooksAhead(), HidesIt()])
 def test_a_detector_that_looks_ahead_is_refused(detector: Detector, one: Scene) -> None:
-    found = feed(detector, one, drawn_edges(one, 1))
+    found = feed(detector, one, steady(one, FINE_US))
     with pytest.raises(DetectorError, match="must depend on earlier events alone"):
-        audit(detector, one, found, [LEVEL])
+        audit(detector, one, drawn_edges(one, 1), found, [LEVEL])
 
 
 def test_a_detector_that_does_not_is_accepted(one: Scene) -> None:
-    found = feed(Counting(), one, drawn_edges(one, 1))
-    fine = audit(Counting(), one, found, [-np.inf, LEVEL])
-    assert np.array_equal(fine.value, found.value)
+    found = feed(Counting(), one, steady(one, FINE_US))
+    again = audit(Counting(), one, drawn_edges(one, 1), found, [-np.inf, LEVEL])
+    assert np.array_equal(again.value, found.value)
     assert (found.value > LEVEL).any()
 
 
@@ -92,11 +92,11 @@ def test_rounding_is_no_look_ahead(one: Scene) -> None:
             found = super().push(events, until_us)
             return Evidence.of(found.t_us, found.value * (1 + 1e-6 * len(events)))
 
-    found = feed(Rounded(), one, drawn_edges(one, 1))
-    audit(Rounded(), one, found, [LEVEL])
+    found = feed(Rounded(), one, steady(one, FINE_US))
+    audit(Rounded(), one, drawn_edges(one, 1), found, [LEVEL])
 
 
-def test_chunks_of_tests_are_drawn_anew_and_cover_the_scene(one: Scene) -> None:
+def test_longer_chunks_are_drawn_anew_and_cover_the_scene(one: Scene) -> None:
     edges = drawn_edges(one, 1)
     assert edges == drawn_edges(one, 1)
     assert edges != drawn_edges(one, 2)

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.alarms import SceneEvidence
+from sliplab.analysis.detectors.alarms import Level, SceneEvidence
 from sliplab.analysis.detectors.detector import Evidence, Slip
+from sliplab.plugins.bench import figures
 from sliplab.plugins.bench.figures import accuracy, disturbed_rate, scores
+from sliplab.storage.schema.evaluation import AlarmRate
 
 SLIP = Slip(5_000_000, 5_100_000, 8_000_000)
 
@@ -44,6 +46,14 @@ def test_interval_of_false_alarms_is_wider_where_one_world_has_all() -> None:
     assert one.false_alarms.value == spread.false_alarms.value == pytest.approx(4 / hours)
     assert one.false_alarms.high is not None
     assert one.false_alarms.high > 2 * 10.2416 / hours
+
+
+@pytest.mark.parametrize(("at_s", "promised"), [((), True), ((1.0,), True), ((1.0, 3.0), False)])
+def test_test_scenes_refute_a_promise(at_s: tuple[float, ...], promised: bool) -> None:
+    slides = [in_world(f"{k}", *(at_s if k < 2 else ())) for k in range(40)]  # of 200 s
+    none = AlarmRate(alarms=0, hours=1.0, value=0.0, low=None, high=None)
+    (point,) = figures.tested(slides, [Level(5.0, 1.0, none, promised=True)])
+    assert point.promised is promised
 
 
 def test_scenes_of_a_world_are_one_in_intervals() -> None:

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import json
+import pickle
+import struct
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import pytest
 
-from sliplab.analysis.detectors.detector import Scene
+from sliplab.analysis.detectors.alarms import Level
+from sliplab.analysis.detectors.detector import DetectorError, Scene
 from sliplab.plugins.bench import run, scenes
-from sliplab.plugins.bench.apart import ApartDetector
+from sliplab.plugins.bench.apart import ApartDetector, alone, decoded
 from sliplab.plugins.bench.definition import SIZES, ScenePart, Size
 from sliplab.plugins.bench.document import BenchResult
 from sliplab.plugins.bench.entries.thresholds import EventRate
 from sliplab.plugins.bench.nuisances import NUISANCES
 from sliplab.protocols.errors import InputError
+from sliplab.storage.schema.evaluation import AlarmRate
 from tests.command_line import here
 from tests.patching import loose
-from tests.plugins.bench.made import InThisProcess
+from tests.plugins.bench.made import InThisProcess, some_scenes
 
 TINY = Size(ScenePart(1, 2, 0), ScenePart(1, 3, 0), ScenePart(2, 2, 0), 1)
 NAMES = ("rate", "always", "random")
@@ -206,6 +212,7 @@ def test_the_leaderboard_is_written_between_its_lines(folder: Path, tmp_path: Pa
     assert (tmp_path / "images" / "bench.svg").exists()
 
 
+@pytest.mark.usefixtures("apart")
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -231,8 +238,36 @@ def test_wrong_input_is_said_before_anything_is_simulated(
 @pytest.mark.usefixtures("apart")
 def test_a_detector_that_breaks_the_rules_is_named(tmp_path: Path) -> None:
     name = "tests.plugins.bench.made:Broken"
-    with pytest.raises(InputError, match=rf"DETECTOR = {name}: .*: push returned int"):
+    expected = rf"DETECTOR = {name}: validation 1.1: push returned int"
+    with pytest.raises(InputError, match=expected):
         run.run_bench([name], "small", 1, tmp_path)
+
+
+def test_a_detector_that_ships_elsewhere_is_not_imported_by_the_judge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "entry_of_a_guest.py").write_text(
+        "from tests.plugins.bench.made import Counting as Mine\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "ApartDetector", ApartDetector)
+    before = run._contents("entry_of_a_guest:Mine")
+    assert "entry_of_a_guest" not in sys.modules
+    with (tmp_path / "entry_of_a_guest.py").open("a") as file:
+        file.write("# changed\n")
+    assert run._contents("entry_of_a_guest:Mine") != before
+
+
+@pytest.mark.parametrize("dishonest", [False, True])
+def test_evidence_dated_back_gains_nothing_though_a_scene_is_remembered(dishonest: bool) -> None:
+    detector = InThisProcess(f"tests.plugins.bench.made:{'Remembers' if dishonest else 'Late'}")
+    none = Level(
+        1.0, 15.0, AlarmRate(alarms=0, hours=1.0, value=0.0, low=None, high=None), promised=True
+    )
+    prepared = run.Prepared(loose(detector), [none], 0.0)
+    row = run.measure("mine", prepared, run.Tests(some_scenes(3), {}), 1, lambda: None)
+    assert row.table.test.early == 0
+    assert row.table.test.latency_ms.value == pytest.approx(60.0, abs=5.0)
 
 
 @pytest.mark.long
@@ -247,10 +282,60 @@ def test_a_detector_has_nothing_but_what_it_was_given(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_seed_is_drawn_once_for_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
-    drawn = iter((1, 2))  # whose scenes have been simulated
+    drawn = iter((1, 2, 1))  # whose scenes have been simulated
     monkeypatch.setattr(run.secrets, "randbelow", lambda _: next(drawn))
     seeds = [run.run_bench(["always"], "small", None, at).seed for at in (one, one, two)]
     assert seeds == [1, 1, 2]
-    (one / run.SEED_FILE).write_text('{"seed": "x"}')
-    with pytest.raises(InputError, match="must be a whole number"):
-        run.run_bench(["always"], "small", None, one)
+    found = run.run_bench(["always", "never"], "small", None, two)
+    assert found.seed == 1, "one that was published is no test of what had no result with it"
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_drawn_seed_is_published_when_the_judging_ends(
+    stop: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seed = 1  # whose scenes have been simulated
+    monkeypatch.setattr(run.secrets, "randbelow", lambda _: seed)
+    judging: list[bool] = []
+
+    def train(*_: object) -> None:
+        judging.append((tmp_path / run.SEED_FILE).exists())
+        if stop:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(EventRate, "train", train)
+    with pytest.raises(KeyboardInterrupt) if stop else nullcontext():
+        run.run_bench(["rate"], "small", None, tmp_path)
+    assert judging == [False]
+    assert json.loads((tmp_path / run.SEED_FILE).read_text()) == {"seed": seed}
+
+
+@pytest.mark.parametrize("seed", ['"x"', "-5", "true", "1.5", "99999999999999999999", "null"])
+def test_a_seed_that_is_none_is_refused(seed: str, tmp_path: Path) -> None:
+    (tmp_path / run.SEED_FILE).write_text(f'{{"seed": {seed}}}')
+    with pytest.raises(InputError, match="must be a whole number from 0 to"):
+        run.run_bench(["always"], "small", None, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"?", b"e", b"e" + bytes(9), b"j{", pickle.dumps((True, None))], ids=repr
+)
+def test_an_answer_that_is_none_is_refused(data: bytes) -> None:
+    with pytest.raises((ValueError, struct.error)):
+        decoded(data)
+
+
+@pytest.mark.parametrize(
+    ("detector", "expected"), [("Neighbours", 1.0), ("Counting", None), ("Strange", DetectorError)]
+)
+def test_a_detector_states_its_cost_from_a_process_alone(
+    detector: str, expected: float | type[DetectorError] | None
+) -> None:
+    if detector == "Neighbours" and not alone():
+        pytest.skip("this system has no namespaces for a user")
+    with closing(ApartDetector(f"tests.plugins.bench.made:{detector}")) as found:
+        if isinstance(expected, type):
+            with pytest.raises(expected, match="cost = "):
+                found.cost()
+        else:
+            assert found.cost().operations == expected

@@ -116,7 +116,7 @@ def test_a_computer_that_stood_still_is_no_fault_of_the_child(monkeypatch: Any) 
         """A pipe during whose first wait a minute passes."""
 
         closed = False
-        send, recv = staticmethod(pipe.send), staticmethod(pipe.recv)
+        send, recv_bytes = staticmethod(pipe.send), staticmethod(pipe.recv_bytes)
 
         def poll(self, within_s: float) -> bool:
             if not late_ns[0]:
