@@ -15,6 +15,7 @@ import sys
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import typer
@@ -24,6 +25,7 @@ from typer.exceptions import TyperException
 from sliplab.flows.running import console, exit_codes, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.plugin import package_of
 from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
 
 LONGEST_SHOWN = 80
@@ -77,6 +79,8 @@ _EXPECTED = {
     "MainModuleError",
 }
 """Errors that need no traceback, by name: their modules are slow to import."""
+_PACKAGES = ("sliplab.plugins", "sliplab.drivers", "sliplab.units")
+"""Entry points of other packages."""
 _OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|STORE|TRIAL|URL|WHAT")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""
 
@@ -183,8 +187,21 @@ def failure(error: Exception) -> Failure:
         )
     trace = ""
     if not any(kind.__name__ in _EXPECTED for kind in type(error).__mro__):
+        if where := _in_package(error):
+            return Failure(f"{where}: {type(error).__name__}: {_brief(error)}", exit_codes.FAILED)
         trace = "".join(traceback.format_exception(error, limit=-8))
     return Failure(str(error) or type(error).__name__, exit_codes.FAILED, trace=trace)
+
+
+def _in_package(error: Exception) -> str:
+    """Return package, file and line where code of another package failed; empty if none did."""
+    points = [each for group in _PACKAGES for each in entry_points(group=group)]
+    known = {each.module.partition(".")[0]: package_of(each) for each in points}
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        package = known.get(str(frame.f_globals.get("__name__")).partition(".")[0])
+        if package is not None:
+            return f"the package {package} fails in {frame.f_code.co_filename}:{line}"
+    return ""
 
 
 def _in_prefects_settings(error: Exception) -> bool:
