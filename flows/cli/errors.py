@@ -16,7 +16,6 @@ import traceback
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from pathlib import Path
 
 import typer
 from pydantic import ValidationError
@@ -26,7 +25,7 @@ from sliplab.flows.running import console, exit_codes, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import package_of
-from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
+from sliplab.storage.errors import DamagedFile, StoreError, disk_fault, masked, named_disk_error
 
 LONGEST_SHOWN = 80
 """Characters of a file name that is too long."""
@@ -167,9 +166,7 @@ def failure(error: Exception) -> Failure:
             place = f"{place[:LONGEST_SHOWN]}..."
         return Failure(f"{place}: {_NAMES[error.errno]}", exit_codes.WRONG_INPUT, place or None)
     if isinstance(error, OSError) and error.filename:
-        # of a copy the second file is the one that is written
-        place = os.fsdecode(error.filename2 or error.filename)
-        error = disk_error(Path(place), error) or error
+        error = named_disk_error(error) or error
     elif isinstance(error, OSError) and (fault := disk_fault(error)):
         return Failure(f"a file cannot be written: its disk {fault}", exit_codes.FAILED)
     if isinstance(error, StoreError):

@@ -352,6 +352,8 @@ class Trial:
         from sliplab.analysis.report.trial import Example, trial_section
         from sliplab.storage.schema.evaluation import TrialScore
 
+        if "events" not in self.recording.streams("events"):
+            raise StoreError(f"{self.id}: was recorded without events, which the plot shows")
         item, onsets = Collected(self._store.campaign(self.campaign)), self.onsets()
         row = TrialScore(
             campaign=self.campaign,
