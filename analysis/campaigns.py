@@ -258,7 +258,7 @@ def class_names(campaigns: list[Collected]) -> tuple[str, ...]:
     return names
 
 
-def need_slip(campaigns: list[Collected]) -> None:
+def refuse_classes(campaigns: list[Collected]) -> None:
     """See that recordings show a slip.
 
     Raises:
@@ -279,7 +279,7 @@ def kinematic_campaigns(campaigns: list[Collected]) -> list[Collected]:
     """
     found = [item for item in campaigns if item.experiment == "kinematic"]
     if not found:
-        need_slip(campaigns)
+        refuse_classes(campaigns)
         raise StoreError("no kinematic campaign to train on; collect one first")
     return found
 

@@ -72,9 +72,11 @@ class Problem(ABC):
 
     Attributes:
         name: of its evaluation among the results of the step.
+        of_slip: its trials are those of slip, which windows, predictions and detectors are about.
     """
 
     name: ClassVar[str]
+    of_slip: ClassVar[bool] = False
     labels: StoreLabels
     campaigns: list[Collected]
 
@@ -259,6 +261,7 @@ class SlipByEvents(EventProblem):
     """No slip, incipient and gross slip, by a spiking network on events."""
 
     name = evaluation.NAME
+    of_slip = True
 
     def used(self) -> list[Collected]:
         """See `EventProblem`; the kinematic ones."""
@@ -326,6 +329,21 @@ def problem_of(labels: StoreLabels, campaigns: list[Collected]) -> Problem:
         if (found := import_foreign(place)(labels, campaigns)) is not None:
             return cast("Problem", found)
     return SlipByEvents(labels, campaigns)
+
+
+def need_slip(labels: StoreLabels, campaigns: list[Collected]) -> None:
+    """See that campaigns pose the problem of slip by events, or by markers.
+
+    Raises:
+        StoreError: they pose another one. InputError, PluginError: as `problem_of`.
+    """
+    found = problem_of(labels, campaigns)
+    if found.of_slip:
+        return
+    raise StoreError(
+        f"campaign '{campaigns[0].name}': its recordings show {found.name}, and this is about "
+        f"slip; for {found.name} there are `sliplab train`, `evaluate` and `report`"
+    )
 
 
 if not TYPE_CHECKING:

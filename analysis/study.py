@@ -57,8 +57,9 @@ class Study(Generic[ResultT]):
     Attributes:
         name: of its command and files.
         title: of the JSON Schema of its result.
-        measure: does the work. Its parameters are the options of the command, its docstring is the
-            help; it imports what is slow to import when it is called.
+        measure: does the work. Its parameters are the options of the command; its docstring is the
+            help, and its ``Args:`` that of options without one. It imports what is slow to import
+            when it is called.
         result: the document that it returns.
         page: a template that extends ``page.html``.
         view: returns the values of the template, given the result and `Finding.more`.

@@ -8,6 +8,7 @@ command prints with ``--json``; a failed check is in the result, not an exceptio
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -158,22 +159,26 @@ class Store:
 
         Args:
             predictions: a row for each window that `windows` lists for ``test``, as a table or its
-                file; docs/models.md describes its columns.
+                file; docs/models.md describes its columns. The table of `Model.predict` has the
+                number of the model's output neurons, by which the margin counts, in its ``attrs``.
             model: a model file.
             engine, margin, smoothing, reviewed, baselines, checks, dask, promise: see ``sliplab
                 evaluate``.
+
+        Returns:
+            what ``sliplab evaluate --json`` prints.
 
         Raises:
             InputError: an argument, or predictions that do not fit, with all their faults.
         """
         from sliplab.flows.evaluations import run_evaluation
-        from sliplab.flows.running import stopping
+        from sliplab.flows.running import console, stopping
 
         if isinstance(predictions, str):
             predictions = Path(predictions)
         names = None if campaigns is None else list(campaigns)
         with stopping.signals():
-            return run_evaluation(
+            found = run_evaluation(
                 self.folder,
                 names,
                 margin=margin,
@@ -187,6 +192,8 @@ class Store:
                 dask=dask,
                 promise=promise,
             )
+        as_printed: Json = json.loads(json.dumps(found, default=console.plain))
+        return as_printed
 
     def windows(
         self,
@@ -208,19 +215,21 @@ class Store:
 
         Raises:
             InputError: there is no such part of the split.
-            StoreError: a trial has no label yet, or there are no slides with events.
+            StoreError: a trial has no label yet, there are no slides with events, or the campaigns
+                pose another problem than slip.
         """
-        from sliplab.analysis.campaigns import collected, need_slip
+        from sliplab.analysis.campaigns import collected
         from sliplab.analysis.labels.reviewed import StoreLabels
+        from sliplab.analysis.problem import need_slip
         from sliplab.analysis.windows.window_table import SPLITS, window_table
         from sliplab.protocols.shown import one_of
 
         if split is not None and split not in SPLITS:
             raise InputError("split", "", split, one_of(split, SPLITS))
         found = collected(self._store, None if campaigns is None else list(campaigns))
-        need_slip(found)
-        splits = SPLITS if split is None else (split,)
-        return window_table(StoreLabels(self._store, reviewed), found, splits)
+        labels = StoreLabels(self._store, reviewed)
+        need_slip(labels, found)
+        return window_table(labels, found, SPLITS if split is None else (split,))
 
     def torch_dataset(
         self, split: str = "train", *, windows: pd.DataFrame | None = None
@@ -321,9 +330,13 @@ class Store:
 
         Raises:
             StoreError: there is neither yet, or it is of an older version.
+            ModuleNotFoundError: the extra ``parquet`` is not installed.
         """
         import pandas as pd
 
+        from sliplab.protocols.later import need
+
+        need("pyarrow")
         evaluated = self.folder / "derived" / "evaluation" / "scores.parquet"
         reported = self.folder / "report" / "scores.parquet"
         if evaluated.exists() and not reported.exists():
@@ -385,8 +398,15 @@ class Store:
         return add_note(self._store, text, who=who)
 
     def models(self) -> list[Path]:
-        """Files of the networks that were trained here."""
-        return sorted((self.folder / "models").glob("*.pt"))
+        """Files of the networks that were trained here: ``seed0.pt``, and so on, come first.
+
+        Then those to compare with, which `analysis.also` names.
+        """
+
+        def order(path: Path) -> tuple[bool, int, str]:
+            return not path.name.startswith("seed"), len(path.name), path.name
+
+        return sorted((self.folder / "models").glob("*.pt"), key=order)
 
     def plot(self, campaign: str | None = None) -> Figure:
         """Event rate, tightest gate and failed attempts over a campaign, as in the report.
@@ -430,12 +450,13 @@ class Store:
 class Model:
     """A trained network, run on events by the event-driven kernels."""
 
-    def __init__(self, fitted: Fitted, simulated: bool = False) -> None:
-        self.fitted, self.simulated = fitted, simulated
+    def __init__(self, fitted: Fitted, simulated: bool = False, name: str = "") -> None:
+        self.fitted, self.simulated, self.name = fitted, simulated, name
 
     def __repr__(self) -> str:
         simulated = ", simulated" if self.simulated else ""
-        return f"<Model of {', '.join(self.classes)}; seed {self.fitted.seed}{simulated}>"
+        name, seed = self.name and f" {self.name}", self.fitted.seed
+        return f"<Model{name} of {', '.join(self.classes)}; seed {seed}{simulated}>"
 
     def _repr_html_(self) -> str:
         chosen, windows = self.fitted.chosen, self.fitted.windows
@@ -468,7 +489,7 @@ class Model:
             InputError: the network tells other classes than those of slip.
             StoreError: see `Store.windows`.
         """
-        from sliplab.analysis.evaluation.predictions import COLUMNS
+        from sliplab.analysis.evaluation.predictions import COLUMNS, OUTPUTS
         from sliplab.analysis.networks import training
 
         self.fitted.check_slip("model", "a prediction of slip")
@@ -477,7 +498,9 @@ class Model:
         starts = windows.drop(columns="end_ns")
         counts = training.predict_counts(self.fitted, store._counts(starts, self.fitted.windows))
         columns = dict(zip(COLUMNS["spikes"], counts.T, strict=True))
-        return windows[["campaign", "trial", "start_ns"]].assign(**columns)
+        table = windows[["campaign", "trial", "start_ns"]].assign(**columns)
+        table.attrs[OUTPUTS] = self.fitted.network.outputs_per_class
+        return table
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -522,6 +545,9 @@ class Model:
 
         chunk = EventChunk(events.x, events.y, events.p, events.t_ns // 1000)
         starts_us = np.asarray(start_ns) // 1000
+        if starts_us.ndim != 1:
+            text = f"must be an array of shape (n,), not {starts_us.shape}"
+            raise InputError("start_ns", "", None, text)
         try:
             windows = list_events(chunk, starts_us, self.fitted.windows, *size_px)
         except ValueError as error:
@@ -560,7 +586,7 @@ def load_model(path: str | Path) -> Model:
     place = Path(path)
     made_in = place.parent.parent  # of STORE/models/NAME.pt
     stored = (made_in / STORE).is_file() and TrialStore.open(made_in).simulated
-    return Model(load(place), stored)
+    return Model(load(place), stored, place.name)
 
 
 @checked
@@ -674,8 +700,8 @@ def export(
         form: its name, such as ``aedat4``, ``dsec``, ``labels`` or ``croissant``.
         output: folder to write, or file for labels or samples.
         part: a campaign or a trial of the store, where the form is of one.
-        options: of the form: ``campaign``, ``title``, ``creator``, ``licence``, ``stream``,
-            ``store``, ``windows``.
+        options: of the form: ``title``, ``licence``, ``stream``, ``store``, ``windows``;
+            ``campaign`` and ``creator``, one or several.
 
     Returns:
         what was written.
@@ -687,7 +713,11 @@ def export(
     """
     from sliplab.flows import exports
 
-    given = {name: value for name, value in options.items() if value is not None}
+    given = {
+        name: [value] if name in exports.SEVERAL and isinstance(value, str) else value
+        for name, value in options.items()
+        if value is not None
+    }
     request = exports.ExportRequest(str(place), part, form, Path(output), given)
     return dict(exports.export(request).result)
 

@@ -65,6 +65,8 @@ class Export:
     possible: bool = True
 
 
+SEVERAL = frozenset({"campaign", "creator"})
+"""Options with several values."""
 TITLES = {
     "store": "a store",
     "trials": "a campaign or a trial of a store",
@@ -173,9 +175,10 @@ def _chosen(request: ExportRequest) -> tuple[TrialStore, Campaign, list[str]]:
     folder, part = Path(request.place), request.part
     opened = open_store(folder)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
+    there = ", ".join(campaigns) or "none"
     wanted = request.options.get("campaign") or [*campaigns]
     if unknown := [each for each in wanted if each not in campaigns]:
-        text = f"is no campaign of {folder}; campaigns: {', '.join(campaigns)}"
+        text = f"is no campaign of {folder}; campaigns: {there}"
         raise InputError("--campaign", "", unknown[0], text)
     if part in campaigns:
         return opened, campaigns[part], sorted(campaigns[part].committed())
@@ -186,7 +189,7 @@ def _chosen(request: ExportRequest) -> tuple[TrialStore, Campaign, list[str]]:
             "choose one by --campaign"
             if holders
             else f"is no campaign or committed trial of {folder}; campaigns: "
-            f"{', '.join(campaigns)}; `sliplab trials {folder}` lists the trials"
+            f"{there}; `sliplab trials {folder}` lists the trials"
         )
         raise InputError("PART", "", part, text)
     return opened, holders[0], [part]

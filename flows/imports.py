@@ -14,6 +14,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import plugins
 from sliplab.protocols.shown import one_of
 from sliplab.storage.files import safe_name
+from sliplab.storage.formats.foreign import FormatError, refusal
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.known import format_names
 from sliplab.storage.formats.recognition import kind_of, skipped_in, trials_in
@@ -64,16 +65,19 @@ def import_data(
         raise InputError("--name", "", None, "is missing: the name of the new campaign")
     if kind is not None and kind not in format_names():
         raise InputError("KIND", "", kind, one_of(kind, format_names()))
-    found_kind = kind_of(path) if kind is None else kind
-    check_name(name)
-    skipped = skipped_in(path, found_kind)
-    found = trials_in(path, found_kind, salvage=salvage)
-    if simulated:
-        found = (replace(trial, simulated=True) for trial in found)
-    with new_store(store) as opened, store_lock(opened):
-        result = import_trials(
-            opened, name, found, path, found_kind, lambda it: console.say(it), salvage=salvage
-        )
+    try:
+        found_kind = kind_of(path) if kind is None else kind
+        check_name(name)
+        skipped = skipped_in(path, found_kind)
+        found = trials_in(path, found_kind, salvage=salvage)
+        if simulated:
+            found = (replace(trial, simulated=True) for trial in found)
+        with new_store(store) as opened, store_lock(opened):
+            result = import_trials(
+                opened, name, found, path, found_kind, lambda it: console.say(it), salvage=salvage
+            )
+    except FormatError as error:  # of a whole folder
+        raise refusal(error.file or path, error) from None
     say_faults(result)
     for item in skipped:
         console.say(f"skipped: {item.file}: {item.reason}")

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, need_slip, training_campaigns
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.alarms import SceneEvidence, false_alarm_rate, outcome
 from sliplab.analysis.detectors.feeding import feed
 from sliplab.analysis.detectors.latency import median_with_lost
 from sliplab.analysis.detectors.skin import calibrated, load_calibration
 from sliplab.analysis.detectors.stored_scenes import each_scene, judged_scene
 from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.problem import need_slip
 from sliplab.flows.label import report_states
 from sliplab.flows.running import console
 from sliplab.flows.steps import StepResult
@@ -65,9 +66,10 @@ def judge_detector(
         InputError: the calibration, or a trial of a sensor of another size.
         StoreError: no test trial has both onsets, or one has no label yet.
     """
-    need_slip(campaigns)
+    labels = StoreLabels(store, reviewed)
+    need_slip(labels, campaigns)
     skin = load_calibration(model)
-    detector, labels = calibrated(skin), StoreLabels(store, reviewed)
+    detector = calibrated(skin)
     used = training_campaigns(campaigns)
     found: list[SceneEvidence] = []
     with console.bar("trials", 0) as bar:

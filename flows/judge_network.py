@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from prefect import flow
 
-from sliplab.analysis.campaigns import Collected, need_slip
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation import networks
 from sliplab.analysis.evaluation.networks import CountedBy, Engines, Judgement, network_of
 from sliplab.analysis.evaluation.trials import item_trials, quiet_alarms, summaries
 from sliplab.analysis.labels.reviewed import StoreLabels
+from sliplab.analysis.problem import need_slip
 from sliplab.analysis.trial_work import KeepTrials, Make, TrialWork
 from sliplab.flows.label import report_states
 from sliplab.flows.running.orchestration import run
@@ -88,8 +89,9 @@ def judge_model(
         InputError: the model; the message says what would be right.
         StoreError: a trial has no label yet.
     """
-    need_slip(campaigns)
-    network, labels = network_of(model, engine), StoreLabels(store, reviewed)
+    labels = StoreLabels(store, reviewed)
+    need_slip(labels, campaigns)
+    network = network_of(model, engine)
     judgement = networks.file_judgement(labels, campaigns, network, margin, smoothing)
     return _scores(judgement, cluster)
 
@@ -114,8 +116,8 @@ def judge_predictions(
     """
     from sliplab.analysis.evaluation.predictions import prediction_judgement
 
-    need_slip(campaigns)
     labels = StoreLabels(store, reviewed)
+    need_slip(labels, campaigns)
     return _scores(prediction_judgement(labels, campaigns, predictions, margin, smoothing), cluster)
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from sliplab.analysis.campaigns import Collected, need_slip
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.evaluation import baselines
 from sliplab.analysis.labels.reviewed import StoreLabels
 from sliplab.analysis.metrics import classification as metrics
@@ -24,7 +24,7 @@ from sliplab.analysis.networks.window_checks import (
     permuted,
     shuffled_chance,
 )
-from sliplab.analysis.problem import problem_of
+from sliplab.analysis.problem import need_slip, problem_of
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.run_records import timed
@@ -102,9 +102,10 @@ def window_checks(
     Raises:
         StoreError: a check failed; the message says which figure cannot be trusted.
     """
-    need_slip(campaigns)
+    labels = StoreLabels(store, reviewed)
+    need_slip(labels, campaigns)
     settings = training_settings(campaigns)
-    load = partial(load_samples, StoreLabels(store, reviewed), campaigns)
+    load = partial(load_samples, labels, campaigns)
     train, validation, test = map(load, SPLITS)
     if not len(test):
         raise StoreError("there are no test samples to check; collect more trials")

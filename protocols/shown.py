@@ -116,6 +116,8 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 def one_of(name: object, names: Iterable[str]) -> str:
     """Return ``must be one of a, b``, with the nearest of them for a misspelt name."""
     known = list(names)
+    if not known:
+        return "is not there: there is none"
     return f"must be one of {', '.join(known)}{did_you_mean(str(name), known)}"
 
 

@@ -164,7 +164,8 @@ def driven_rig(
         arm = devices.arm_driver.builder(_arm_measures(file, devices))(settings)
         further = []
         for name, stream in file.streams.items():
-            further.append(driven_stream(name, stream, arm, taught_frame(file)))
+            simulated = simulation is not None
+            further.append(driven_stream(name, stream, arm, taught_frame(file), simulated))
             undo.callback(further[-1].close)
         rig = Rig(
             name=file.name,
@@ -205,8 +206,13 @@ def _frame_camera(file: RigFile, devices: DeviceSettings) -> FrameCamera:
     return devices.frame_camera_driver.build(devices.frame_camera, scale)
 
 
-def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> DeviceStream:
+def driven_stream(
+    name: str, stream: Stream, arm: Arm, plate: PlateFrame, simulated: bool = False
+) -> DeviceStream:
     """Build a further device by its driver; the arm's controller may measure its forces.
+
+    Args:
+        simulated: it is one of a loopback rig.
 
     Raises:
         RigError: it is missing, or delivers other time stamps than the rig file says.
@@ -220,7 +226,8 @@ def driven_stream(name: str, stream: Stream, arm: Arm, plate: PlateFrame) -> Dev
     elif isinstance(driver, ForceSensorDriver):
         device = driver.build(settings, arm)
     elif isinstance(driver, SensorDriver):
-        device = driver.build(settings)
+        simulate = driver.simulate if simulated else None
+        device = simulate(settings, HostClock()) if simulate else driver.build(settings)
     assert device is not None  # the rig file was checked against its driver
     with ExitStack() as undo:
         undo.callback(device.close)

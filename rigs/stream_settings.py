@@ -194,14 +194,21 @@ class ForceStream(_StreamSettings):
 
 
 class SensorStream(_StreamSettings):
-    """A sensor of a kind that another package declares; timed by arrival, on real rigs."""
+    """A sensor of a kind that another package declares; timed by arrival."""
 
     GRADES = ("host arrival", "host time")
     DRIVERS = SensorDriver
 
     kind: str
     device: Annotated[DriverSettings, OfKind(SensorDriver)] | None = None
+    """Its driver, on simulated rigs too."""
     mock: None = None
+
+    @field_validator("mock", mode="before")
+    @classmethod
+    def _by_its_driver(cls, mock: object) -> None:
+        if mock is not None:
+            raise ValueError("must be left out: the driver of its device simulates this kind")
 
 
 Stream = EventStream | FrameStream | ForceStream | ScalarStream | SensorStream
@@ -251,13 +258,30 @@ def stream_faults(
             yield KeyedError(key, name, f"a stream's name must match {NAME.pattern}")
         if name in RESERVED:
             yield KeyedError(key, name, "is the name of one of a rig's first devices")
-        for part, needed in (("mock", "mock" in sections), ("device", "devices" in sections)):
+        driver = stream.driver
+        needs = {"mock": "mock" in sections, "device": "devices" in sections}
+        if needs["mock"] and _simulated_by_driver(stream, needs["device"]):
+            needs = {"mock": False, "device": True}
+            if isinstance(driver, SensorDriver) and driver.simulate is None:
+                text = f"declares no `simulate`, which driver: {rig_driver} needs of it"
+                yield KeyedError(f"{key}.device.driver", driver.name, text)
+        for part, needed in needs.items():
             found = getattr(stream, part)
             if needed and found is None:
                 yield KeyedError(f"{key}.{part}", None, f"is needed by driver: {rig_driver}")
             if not needed and found is not None:
                 text = f"has no meaning with driver: {rig_driver}"
                 yield KeyedError(f"{key}.{part}", "...", text)
+
+
+def _simulated_by_driver(stream: Stream, driven: bool) -> bool:
+    """Return whether a simulated rig has the stream by the `simulate` of its driver.
+
+    Args:
+        driven: the rig has drivers on fakes.
+    """
+    own = isinstance(stream.driver, SensorDriver) and (driven or stream.mock is None)
+    return own or isinstance(stream, SensorStream)
 
 
 def stream_drivers(streams: Mapping[str, Stream]) -> Iterator[tuple[str, Driver[Any], Any]]:

@@ -111,6 +111,13 @@ def disk_error(folder: Path, error: BaseException, then: str = _GO_ON) -> StoreE
     return StoreError(f"{folder}: its disk {fault}: {todo}, then {then}")
 
 
+def named_disk_error(error: OSError) -> StoreError | None:
+    """Translate an error of a disk that names a file; None for any other error."""
+    # of a copy the second file is the one that is written
+    name = error.filename2 or error.filename
+    return disk_error(Path(os.fsdecode(name)), error) if name else None
+
+
 @contextmanager
 def translated_disk_errors(folder: Path, *others: type[BaseException]) -> Iterator[None]:
     """Turn a disk's errors inside the block into one `StoreError` that says what to do.

@@ -7,6 +7,7 @@ later (docs/decisions/time.md). All times are int64.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
 from functools import cache
@@ -22,14 +23,22 @@ U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 
 
+NUMBERS = frozenset(np.dtype(letter).name for letter in "?bBhHiIqQefd")
+"""Types of columns: truth values, integers and floats of up to 64 bits."""
+MOST_RANK, MOST_COLUMNS = 4, 512
+STREAM_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+"""Names of streams, of their kinds and of columns."""
+
+
 class Column(NamedTuple):
     """A column of a stored stream."""
 
     field: str
     """The field of the stream's chunks."""
     dtype: str
+    """One of `NUMBERS`, by any of numpy's names."""
     shape: tuple[int, ...]
-    """Of one row; -1 for a length that the first row decides."""
+    """Of one row, `MOST_RANK` at most; -1 for a length that the first row decides."""
     unit: str
 
 
@@ -44,12 +53,32 @@ class StreamKind:
         indexed: rows are found by their time, through an index.
         camera: ``events`` or ``frames``, the first camera in whose groups it is, where a camera
             sends it: a further camera has a file with the same groups.
+
+    Raises:
+        ValueError: it could not be stored: a name, no ``t``, or what a column's rows are.
     """
 
     name: str
     columns: Mapping[str, Column]
     indexed: bool = False
     camera: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the columns."""
+        for name in (self.name, *self.columns):
+            if not STREAM_NAME.fullmatch(name):
+                text = f"name {name!r} must match {STREAM_NAME.pattern}"
+                raise ValueError(f"stream kind {self.name}: {text}")
+        if "t" not in self.columns:
+            raise ValueError(f"stream kind {self.name}: has no column t, the time of each row")
+        if len(self.columns) > MOST_COLUMNS:
+            raise ValueError(f"stream kind {self.name}: has more than {MOST_COLUMNS} columns")
+        for name, column in self.columns.items():
+            known = {"int64"} if name in {"t", "host"} else NUMBERS
+            if np.dtype(column.dtype).name not in known or len(column.shape) > MOST_RANK:
+                text = f"must be of {', '.join(sorted(known))}, with {MOST_RANK} axes a row at most"
+                found = f"{column.dtype}, {column.shape}"
+                raise ValueError(f"stream kind {self.name}: column {name} = {found}: {text}")
 
     def timed_by(self, unit: str) -> StreamKind:
         """Return the same kind with another unit of its times."""

@@ -49,6 +49,8 @@ COLUMNS: dict[Kind, tuple[str, ...]] = {
     "spikes": tuple(f"{name}_spikes" for name in CLASSES),
 }
 """Columns by what they hold."""
+OUTPUTS = "outputs_per_class"
+"""Attribute of a table: output neurons of a class, by which the protocol's margin counts."""
 MOST_SPIKES = 1_000_000
 """Spikes of a class in a window that a table may state."""
 _SCALE: dict[Kind, int] = {"class": 1, "probability": 1_000_000, "spikes": 1}
@@ -124,7 +126,8 @@ def prediction_judgement(
     data_key(labels, campaigns)  # every test trial has a label
     path = source if isinstance(source, Path) else None
     where = "--predictions" if path is None else str(path)
-    kind, table, faults = _checked(read_predictions(path) if path else source, where)
+    given = read_predictions(source) if isinstance(source, Path) else source
+    kind, table, faults = _checked(given, where)
     if kind != "spikes":
         margin = 0.0 if margin is None else margin
         if margin > 1:
@@ -141,17 +144,22 @@ def prediction_judgement(
         key = make_key("predictions", 1, [it.recording.checksum, it.key], values.tolist())
         outputs[it.trial] = key, arrays
     settings = training_campaigns(campaigns)[0].settings
+    per_class = given.attrs.get(OUTPUTS, settings.network.outputs_per_class)
     network = OtherNetwork(
         "predictions" if path is None else f"predictions-{path.stem}",
         "predictions" if path is None else path.name,
         "".join(key for key, _ in outputs.values()).encode(),
         None,
         settings.windows,
-        settings.network.outputs_per_class,
+        per_class if _is_count(per_class) else settings.network.outputs_per_class,
         "predictions",
     )
     judgement = file_judgement(labels, campaigns, network, margin, smoothing)
     return PredictionJudgement(**vars(judgement), outputs=outputs, scale=_SCALE[kind])
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int | float) and 0 < value < MOST_SPIKES
 
 
 def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame, list[InputError]]:

@@ -1,7 +1,7 @@
 """A kind of stream that SlipLab does not know, in one file: an inertial sensor on the arm.
 
-With the entry point `lab_imu = "lab_imu:DRIVER"` of `sliplab.drivers`, a rig file names it under
-`streams` as `wrist: {kind: imu, device: {driver: lab_imu}}`.
+A rig file, simulated or not, names it under `streams` as
+`wrist: {kind: imu, device: {driver: lab_imu}}`.
 """
 
 from __future__ import annotations
@@ -74,5 +74,6 @@ DRIVER = SensorDriver(
     settings=ImuSettings,
     ping=lambda settings: None,
     build=lambda settings: Imu(HostClock()),
+    simulate=lambda settings, clock: Imu(clock),
     stream=IMU,
 )

@@ -15,7 +15,7 @@ import sys
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from importlib.metadata import entry_points
 
 import typer
 from pydantic import ValidationError
@@ -24,7 +24,8 @@ from typer.exceptions import TyperException
 from sliplab.flows.running import console, exit_codes, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
-from sliplab.storage.errors import DamagedFile, StoreError, disk_error, disk_fault, masked
+from sliplab.protocols.plugin import package_of
+from sliplab.storage.errors import DamagedFile, StoreError, disk_fault, masked, named_disk_error
 
 LONGEST_SHOWN = 80
 """Characters of a file name that is too long."""
@@ -77,6 +78,8 @@ _EXPECTED = {
     "MainModuleError",
 }
 """Errors that need no traceback, by name: their modules are slow to import."""
+_PACKAGES = ("sliplab.plugins", "sliplab.drivers", "sliplab.units")
+"""Entry points of other packages."""
 _OPTION = re.compile(r"--[a-z-]+|COMMAND|DETECTOR|FOLDER|KIND|NAME|PART|STORE|TRIAL|URL|WHAT")
 """Names of options and arguments: an `InputError` about one has it in place of a file."""
 
@@ -163,9 +166,7 @@ def failure(error: Exception) -> Failure:
             place = f"{place[:LONGEST_SHOWN]}..."
         return Failure(f"{place}: {_NAMES[error.errno]}", exit_codes.WRONG_INPUT, place or None)
     if isinstance(error, OSError) and error.filename:
-        # of a copy the second file is the one that is written
-        place = os.fsdecode(error.filename2 or error.filename)
-        error = disk_error(Path(place), error) or error
+        error = named_disk_error(error) or error
     elif isinstance(error, OSError) and (fault := disk_fault(error)):
         return Failure(f"a file cannot be written: its disk {fault}", exit_codes.FAILED)
     if isinstance(error, StoreError):
@@ -183,8 +184,21 @@ def failure(error: Exception) -> Failure:
         )
     trace = ""
     if not any(kind.__name__ in _EXPECTED for kind in type(error).__mro__):
+        if where := _in_package(error):
+            return Failure(f"{where}: {type(error).__name__}: {_brief(error)}", exit_codes.FAILED)
         trace = "".join(traceback.format_exception(error, limit=-8))
     return Failure(str(error) or type(error).__name__, exit_codes.FAILED, trace=trace)
+
+
+def _in_package(error: Exception) -> str:
+    """Return package, file and line where code of another package failed; empty if none did."""
+    points = [each for group in _PACKAGES for each in entry_points(group=group)]
+    known = {each.module.partition(".")[0]: package_of(each) for each in points}
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        package = known.get(str(frame.f_globals.get("__name__")).partition(".")[0])
+        if package is not None:
+            return f"the package {package} fails in {frame.f_code.co_filename}:{line}"
+    return ""
 
 
 def _in_prefects_settings(error: Exception) -> bool:

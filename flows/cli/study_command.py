@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin
 
 import typer
 
@@ -43,10 +44,29 @@ def study_app(study: Study[Any]) -> typer.Typer:
 
     own = inspect.signature(study.measure, eval_str=True).parameters.values()
     kind = inspect.Parameter.KEYWORD_ONLY
+    about, helps = _parts(inspect.getdoc(study.measure) or "")
     as_json = inspect.Parameter("as_json", kind, default=False, annotation=JsonOption)
-    parameters = [each.replace(kind=kind) for each in own]
+    parameters = [
+        each.replace(kind=kind, annotation=_option(each.annotation, helps.get(each.name)))
+        for each in own
+    ]
     run.__signature__ = inspect.Signature([*parameters, as_json])  # type: ignore[attr-defined]
-    run.__doc__ = inspect.getdoc(study.measure)
+    run.__doc__ = about
     app = typer.Typer()
     app.command(study.name, epilog=f"Example: {study.example}")(run)
     return app
+
+
+def _parts(text: str) -> tuple[str, dict[str, str]]:
+    """Return a docstring without its sections, and the meanings of ``Args:`` by name."""
+    about, *sections = re.split(r"^(Args|Returns|Raises|Yields):\n", text, flags=re.MULTILINE)
+    found = dict(zip(sections[::2], map(inspect.cleandoc, sections[1::2]), strict=True))
+    named = re.findall(r"^(\w+): (.*(?:\n[ ]+.*)*)", found.get("Args", ""), re.MULTILINE)
+    return about.strip(), {name: " ".join(words.split()) for name, words in named}
+
+
+def _option(annotation: Any, words: str | None) -> Any:
+    """Return the annotation of an option, with its help where it has none."""
+    if words is None or get_origin(annotation) is Annotated:
+        return annotation
+    return Annotated[annotation, typer.Option(help=words[:1].upper() + words[1:])]

@@ -14,6 +14,7 @@ import numpy as np
 
 from sliplab.flows.running import extras
 from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import named_disk_error
 
 CallableT = TypeVar("CallableT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT", bound=type)
@@ -24,7 +25,8 @@ def checked(function: CallableT) -> CallableT:
     """Return a function that checks its arguments by their annotations.
 
     Text in place of several names is one name, several names are a list. Numbers must be finite.
-    A package that is missing inside is named with its extra (`extras.named`).
+    A package that is missing inside is named with its extra (`extras.named`). What a disk refuses
+    is a StoreError that names the file.
     """
     signature = inspect.signature(function)
 
@@ -41,7 +43,12 @@ def checked(function: CallableT) -> CallableT:
             if parameter.kind not in _NO_ARGUMENTS and name != "self":
                 given.arguments[name] = _checked(name, value, str(parameter.annotation))
         with extras.named(function.__qualname__):
-            return function(*given.args, **given.kwargs)
+            try:
+                return function(*given.args, **given.kwargs)
+            except OSError as error:
+                if stated := named_disk_error(error):
+                    raise stated from error
+                raise
 
     return call  # type: ignore[return-value]
 

@@ -282,7 +282,8 @@ class Trial:
         """The trial as ``xarray.Dataset.from_dict`` takes it: every stream but the video's frames.
 
         Each stream has a dimension of its name, with its times in ``NAME_t_ns``; units are in the
-        names. Streams without a clock are left out. Attributes are the trial's condition and
+        names. Rows of a column have the dimensions ``NAME_COLUMN_axis``, ``NAME_COLUMN_axis2``, and
+        so on. Streams without a clock are left out. Attributes are the trial's condition and
         context, its onsets where it is labelled, and whether it is simulated.
 
         Raises:
@@ -294,7 +295,8 @@ class Trial:
         def add(stream: str, time_ns: I64, attrs: Any = None, /, **columns: Any) -> None:
             coords[f"{stream}_t_ns"] = {"dims": (stream,), "data": time_ns, "attrs": {}}
             for name, values in columns.items():
-                dims = (stream, f"{stream}_{name}_axis")[: values.ndim]
+                axes = (f"{stream}_{name}_axis{n or ''}" for n in (0, *range(2, values.ndim)))
+                dims = (stream, *axes)[: values.ndim]
                 data[f"{stream}_{name}"] = {"dims": dims, "data": values, "attrs": attrs or {}}
 
         coords: Json = {}
@@ -350,6 +352,8 @@ class Trial:
         from sliplab.analysis.report.trial import Example, trial_section
         from sliplab.storage.schema.evaluation import TrialScore
 
+        if "events" not in self.recording.streams("events"):
+            raise StoreError(f"{self.id}: was recorded without events, which the plot shows")
         item, onsets = Collected(self._store.campaign(self.campaign)), self.onsets()
         row = TrialScore(
             campaign=self.campaign,

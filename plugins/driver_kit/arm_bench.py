@@ -95,7 +95,7 @@ class ArmBench(DeviceBench):
         self._build = driver.builder(load is not None)
         self._load = load or (lambda t_s: (0.0,) * 6)
         if driver.fake is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(f"{driver.name} declares no `fake`, on which rules are tried")
         self.driver, self._fake, self.twists = driver, driver.fake, driver.twists
         if settings.limits.frame != "base":
             raise ValueError("limits.frame: must be base for a conformance test, not plate")

@@ -32,7 +32,9 @@ class EventBench(StreamBench):
     def __init__(self, driver: EventCameraDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None or driver.reach is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(
+                f"{driver.name} declares no `fake` and `reach`, on which rules are tried"
+            )
         self._build = driver.build
         self.fake = driver.fake(SIZE)
         self.settings = driver.reach(settings, self.fake.address)
@@ -127,7 +129,7 @@ class FrameBench(StreamBench):
     def __init__(self, driver: FrameCameraDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(f"{driver.name} declares no `fake`, on which rules are tried")
         self._fake, self._unplug = driver.fake, driver.unplug
         self._on_frames: Callable[[FrameChunk], None] = lambda frames: None
         self.shape = SIZE

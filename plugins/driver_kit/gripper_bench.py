@@ -23,7 +23,9 @@ class GripperBench(DeviceBench):
     def __init__(self, driver: GripperDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(bounds)
         if driver.fake is None or driver.reach is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(
+                f"{driver.name} declares no `fake` and `reach`, on which rules are tried"
+            )
         self.driver, self.range = driver, driver.range(settings)
         self.opening_mm: float = settings.opening_mm
         self.fingers = FingerMotion(self.opening_mm, REACTION_NS, ACCELERATION_MM_S2)

@@ -50,7 +50,9 @@ class ForceBench(StreamBench):
     def __init__(self, driver: ForceSensorDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None or driver.reach is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(
+                f"{driver.name} declares no `fake` and `reach`, on which rules are tried"
+            )
         self._build: Callable[[Any, Any], ForceSensor] = driver.build
         self.fake = driver.fake(settings)
         self.settings = driver.reach(settings, self.fake.address)
@@ -89,11 +91,14 @@ class SensorBench(StreamBench):
     """A sensor of rows of numbers, each of which tells its row: they count on."""
 
     capability = Sensor
+    driver: SensorDriver[Any]
 
     def __init__(self, driver: SensorDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None or driver.reach is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(
+                f"{driver.name} declares no `fake` and `reach`, on which rules are tried"
+            )
         self._build: Callable[[Any], Sensor] = driver.build
         self.fake = driver.fake(settings)
         self.settings = driver.reach(settings, self.fake.address)
@@ -103,8 +108,14 @@ class SensorBench(StreamBench):
         """Connect the sensor, which then knows its columns. Raises RigError."""
         self.device = self._build(self.settings)
         self.device.connect()
-        kind = getattr(self.device, "kind", SCALAR)
-        numbers = [column.field for column in kind.columns.values() if column.dtype == "float64"]
+        kind = getattr(self.device, "kind", self.driver.stream or SCALAR)
+        numbers = [
+            column.field
+            for column in kind.columns.values()
+            if column.dtype == "float64" and not column.shape
+        ]
+        if not numbers:
+            raise NotTried(f"{kind.name} has no column of one float64 a row, which rules number")
         self.clock_field, self.fields = numbers[0], tuple(numbers)
 
     def close_fake(self) -> None:
@@ -238,7 +249,9 @@ class SyncBench(StreamBench):
     def __init__(self, driver: SyncBoxDriver[Any], settings: Any, bounds: Bounds) -> None:
         super().__init__(driver, settings, bounds)
         if driver.fake is None or driver.reach is None:
-            raise NotTried(f"{driver.name} declares no fake")
+            raise NotTried(
+                f"{driver.name} declares no `fake` and `reach`, on which rules are tried"
+            )
         self._build = driver.build
         self.trains: list[PulseTrain | None] = []
         """Trains that the box has begun, and None at each end."""

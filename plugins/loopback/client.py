@@ -112,10 +112,11 @@ class Loopback:
             driver = getattr(devices, f"{name}_driver")
             if driver is not None and driver.reach is not None:
                 reached[name] = driver.reach(getattr(devices, name), self.addresses[name])
-        streams: dict[str, Stream] = {}
+        streams = dict(file.streams)
         for name, stream in file.streams.items():
-            assert isinstance(stream.driver, EventCameraDriver)  # the file was held against it
-            assert stream.driver.reach is not None
+            if not isinstance(stream.driver, EventCameraDriver):
+                continue  # its driver simulates it
+            assert stream.driver.reach is not None  # the file was held against it
             device = stream.driver.reach(stream.device, self.addresses[STREAMS + name])
             streams[name] = stream.model_copy(update={"device": device})
         changes = {"devices": devices.model_copy(update=reached), "streams": streams}

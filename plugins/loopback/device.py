@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sliplab.plugins.simulation.settings import MockSettings
 from sliplab.protocols.key_errors import KeyedError
-from sliplab.rigs.core.driver import EventCameraDriver, RigDriver, lazy
+from sliplab.rigs.core.driver import EventCameraDriver, RigDriver, SensorDriver, lazy
 from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.stream_settings import keyed_drivers
 
@@ -45,6 +45,8 @@ def _faults(rig: RigFile) -> Iterator[KeyedError]:
         yield KeyedError("mock.gripper.opening_mm", simulated, text)
     for key, driver, _ in keyed_drivers(devices, rig.streams):
         fake: Any = None
+        if isinstance(driver, SensorDriver):
+            continue  # `stream_faults` has looked at its `simulate`
         if isinstance(driver, EventCameraDriver):
             fake = driver.reach
         elif key.startswith("devices."):

@@ -66,11 +66,12 @@ def wanted_marker_models(labels: StoreLabels, campaigns: list[Collected]) -> lis
     """The models that the settings ask for, one a seed, with the keys they must have.
 
     Raises:
-        StoreError: a trial has no fresh label yet, or there is no kinematic campaign.
+        StoreError: a trial has no fresh label yet or no frames, or there is no kinematic campaign.
     """
     used = kinematic_campaigns(campaigns)
     inputs = []
     for item in used:
+        item.need("frames", "the classifier is trained on the markers in them")
         for trial, recording in item.trials:
             if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")

@@ -23,6 +23,7 @@ class SlipByMarkers(Problem):
     """No slip, incipient and gross slip, by a classifier on marker displacements."""
 
     name = NAME
+    of_slip = True
 
     def reason_against(self, step: str) -> str | None:
         """See `Problem`; searches and hold-outs run a spiking network."""

@@ -23,7 +23,7 @@ from sliplab.protocols.timing import WIRED, Delay, StreamGrade, StreamTiming
 from sliplab.protocols.yaml_file import StrictModel, parse_yaml, read_text, rule, validate
 from sliplab.rigs.build import driven_stream, taught_frame
 from sliplab.rigs.core.device_stream import DeviceStream
-from sliplab.rigs.core.driver import ForceSensorDriver
+from sliplab.rigs.core.driver import ForceSensorDriver, SensorDriver
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.device_section import DeviceSettings
 from sliplab.rigs.rig_file import RigFile, load_rig_file
@@ -36,6 +36,7 @@ from sliplab.rigs.stream_settings import (
 )
 from sliplab.storage.schema.trial import StreamRecord
 from sliplab.storage.streams import (
+    CHUNKS,
     CLOCK,
     EVENTS_KIND,
     FRAMES_KIND,
@@ -48,6 +49,7 @@ from sliplab.storage.streams import (
     PulseChunk,
     ScalarChunk,
     Sink,
+    StreamKind,
     WrenchChunk,
     chunk_type,
 )
@@ -90,6 +92,7 @@ class Source:
         clock: `HOST`, `READS`, `TIMING`, or a name of `SHARED`.
         uncertainty_ns: see `SourceAbout`.
         locks: resources of the device for one program at a time, see `rigs.core.driver.Driver`.
+        declared: kind of its rows, where its driver declares one.
         fault: why it has ended within the trial; None while it runs.
         rows: that came in this trial.
         used: a recorder has it.
@@ -99,6 +102,7 @@ class Source:
     clock: str = TIMING
     uncertainty_ns: float | None = None
     locks: Mapping[str, str] = field(default_factory=dict)
+    declared: StreamKind | None = None
     fault: str | None = None
     rows: int = 0
     used: bool = False
@@ -113,6 +117,13 @@ class Source:
     def device(self) -> Any:
         """The device, or what takes a program's rows."""
         return self.stream.device
+
+    @property
+    def kind(self) -> StreamKind:
+        """The kind of its rows; a device that learns it when it connects has its own `kind`."""
+        own = getattr(self.device, "kind", None)
+        known = own if isinstance(own, StreamKind) else self.declared
+        return known or CHUNKS[self.stream.about.kind].KIND
 
     @property
     def about(self) -> SourceAbout:
@@ -145,7 +156,7 @@ class Source:
             return (WrenchChunk.empty(),)
         if kind == SCALAR.name:
             return (ScalarChunk.empty(unit),)
-        return (chunk_type(self.device.kind).empty(),)
+        return (chunk_type(self.kind).empty(),)
 
     def start(self) -> None:
         """Start streaming. Raises RigError."""
@@ -490,10 +501,11 @@ def _driven(name: str, stream: Stream, plate: PlateFrame) -> Source:
         made.device.keeps_rows = True
     by_reads = stream.kind == EVENTS_KIND or hasattr(made.device, "clock_reads")
     locks = driver.locks(stream.device)
+    declared = driver.stream if isinstance(driver, SensorDriver) else None
     if (shared := getattr(stream.device, "shared_clock", None)) is not None:
         stated_ms: float = getattr(stream.device, "uncertainty_ms", 0.0)
-        return Source(made, shared, stated_ms * 1e6, locks=locks)
-    return Source(made, READS if by_reads else TIMING, locks=locks)
+        return Source(made, shared, stated_ms * 1e6, locks, declared)
+    return Source(made, READS if by_reads else TIMING, None, locks, declared)
 
 
 def _check_name(name: str, kind: str | None) -> None:

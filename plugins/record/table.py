@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.streams import SCALAR, Chunk, Column, ScalarChunk, StreamKind, chunk_type
+from sliplab.storage.streams import (
+    MOST_COLUMNS,
+    SCALAR,
+    STREAM_NAME,
+    Chunk,
+    Column,
+    ScalarChunk,
+    StreamKind,
+    chunk_type,
+)
 
-_COLUMN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 TIMES = ("t", "host")
 PULSES = ("state", "harp", "id")
 """Columns of a stream that sees pulses: a line's levels, a Harp clock's levels, or barcodes."""
@@ -26,12 +33,14 @@ def table_kind(columns: Mapping[str, str]) -> StreamKind:
         columns: the unit of each, by its name.
 
     Raises:
-        InputError: there is none, or a name is no small identifier or is taken by the times.
+        InputError: there is none, or too many; a name is no small identifier, or the times have it.
     """
     for name in columns or ("",):
-        if not _COLUMN.fullmatch(name) or name in TIMES:
-            text = f"a column's name must match {_COLUMN.pattern}, and be neither t nor host"
+        if not STREAM_NAME.fullmatch(name) or name in TIMES:
+            text = f"a column's name must match {STREAM_NAME.pattern}, and be neither t nor host"
             raise InputError("columns", "", name, text)
+    if len(columns) > (most := MOST_COLUMNS - 3):  # with the times
+        raise InputError("columns", "", len(columns), f"must be {most} at most")
     values = {name: Column(name, "float64", (), unit) for name, unit in columns.items()}
     return StreamKind("table", {name: SCALAR.columns[name] for name in TIMES} | values)
 

@@ -63,7 +63,7 @@ def check_common(key: str, names: tuple[str, ...] | str, sources: Iterable[Sourc
 
 def check_pulses(names: tuple[str, ...], sources: Iterable[Source]) -> None:
     """Raise InputError unless two sensors, which are connected, see pulses in the same way."""
-    known = {source.name: source.device.kind for source in sources}
+    known = {source.name: source.kind for source in sources}
     seen = [next((part for part in PULSES if part in known[n].columns), "none") for n in names[:2]]
     if "none" in seen or len(set(seen)) > 1:
         text = f"have the columns {' and '.join(seen)}; must both have one of {', '.join(PULSES)}"

@@ -32,14 +32,15 @@ from sliplab.plugins.simulation.truth import clocks_of, readings_of, truth_of
 from sliplab.plugins.simulation.world import SimulatedWorld
 from sliplab.protocols.nuisances import TrialNuisances
 from sliplab.protocols.timing import FrameGrade, Timing
-from sliplab.rigs.core.capabilities import ArmFault, RigError, Truth
+from sliplab.rigs.core.capabilities import ArmFault, RigError, Sensor, Truth
+from sliplab.rigs.core.driver import SensorDriver
 from sliplab.rigs.core.faults import DeviceGone, DiskFull, StreamGone
 from sliplab.rigs.stream_settings import ScalarStream, Stream
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.streams import Sink
 
 T = TypeVar("T")
-FurtherDevice = MockEventCamera | MockFrameCamera | MockForceSensor | MockThermometer
+FurtherDevice = MockEventCamera | MockFrameCamera | MockForceSensor | MockThermometer | Sensor
 GONE = (
     "does not answer (simulated fault); check its power and its cable, "
     "then run the same command to resume"
@@ -139,7 +140,8 @@ class MockDevices:
         if self.force is not None:
             clocks["force"] = readings_of(self.force.clock, self.sync.clock, recorded_ns)
         for name, device in self.further.items():
-            clock = IDENTITY if device.timed_by_host else device.clock
+            own: Any = device
+            clock = IDENTITY if getattr(own, "timed_by_host", True) else own.clock
             clocks[name] = readings_of(clock, self.sync.clock, recorded_ns)
         return {
             **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px, hold_true_ns),
@@ -194,7 +196,9 @@ def build_mock(
 
 def _further(name: str, stream: Stream, world: SimulatedWorld, box: MockSyncBox) -> FurtherDevice:
     """Build a further device."""
-    settings = stream.mock
+    settings, driver = stream.mock, stream.driver
+    if isinstance(driver, SensorDriver) and driver.simulate is not None:
+        return driver.simulate(stream.device, VirtualClock(world))
     if isinstance(settings, FurtherEventCamera):
         seen = Identity[MockEventCameraSettings](name, settings, settings.clock_ppm, settings.seed)
         return MockEventCamera(world, box, seen)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sliplab.protocols.timing import Code, FrameGrade, StreamGrade
     from sliplab.rigs.core.capabilities import (
         Arm,
+        Clock,
         EventCamera,
         ForceSensor,
         FrameCamera,
@@ -350,6 +351,8 @@ class SensorDriver(Driver[SettingsT]):
     """The kind of its stream; None for readings of one quantity."""
     grade: Callable[[SettingsT], StreamGrade] | None = None
     """Return the only grade of its times; None: as the rig file says."""
+    simulate: Callable[[SettingsT, Clock], Sensor] | None = None
+    """Make a simulated device, timed by a simulated rig's clock; None: no such rig can have it."""
     fake: Callable[[SettingsT], FakeSensor] | None = None
     """Make a fake, for tests of the driver."""
     reach: Callable[[SettingsT, Any], SettingsT] | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -34,7 +35,7 @@ from sliplab.storage.formats.foreign import (
     read_head,
     refusal,
 )
-from sliplab.storage.formats.format import Files
+from sliplab.storage.formats.format import Files, Format
 from sliplab.storage.formats.known import (
     CORE,
     format_names,
@@ -83,7 +84,7 @@ def _data_set(path: Path) -> str | None:
     if not path.is_dir():
         return None
     sets = ((name, each) for name, each in known_formats() if each.read_all is not None)
-    return next((name for name, each in sets if each.sniff(path, b"")), None)
+    return next((name for name, each in sets if _sniffed(each, path, b"")), None)
 
 
 def trials_in(path: Path, kind: str, *, salvage: bool = False) -> Iterator[ForeignTrial]:
@@ -140,7 +141,8 @@ def trials_of(path: Path, wanted: Sequence[Wanted], *, salvage: bool) -> Iterato
     laid_out = layouts()
     for _, each in wanted:
         if (check := known_format(each.kind).check) is not None:
-            check(each.files[0])
+            with suppress(FormatError):  # reading it will say so
+                check(each.files[0])
     alike: dict[str, list[str]] = {}
     for name, each in wanted:
         alike.setdefault(name, []).append(str(each))
@@ -148,8 +150,11 @@ def trials_of(path: Path, wanted: Sequence[Wanted], *, salvage: bool) -> Iterato
     for name, each in wanted:
         if len(alike[name]) == 1:
             found = _opened(each, name, salvage)
-            for layout in laid_out:
-                found = layout.complete(found, each, path)
+            try:
+                for layout in laid_out:
+                    found = layout.complete(found, each, path)
+            except FormatError as error:
+                found = broken(name, str(each), refusal(each.files[0], error))
             yield found
 
 
@@ -407,11 +412,19 @@ def _folder(path: Path) -> Path:
 def _recognised(path: Path) -> tuple[str, ...]:
     """Return the formats that a file or folder is of, by its content."""
     head = b"" if path.is_dir() else read_head(path)
-    found = tuple(name for name, each in CORE.items() if each.sniff(path, head))
+    found = tuple(name for name, each in CORE.items() if _sniffed(each, path, head))
     if found:
         return found  # plug-ins are not asked
     readers = ((name, each) for name, each in known_formats() if each.read is not None)
-    return tuple(name for name, each in readers if each.sniff(path, head))
+    return tuple(name for name, each in readers if _sniffed(each, path, head))
+
+
+def _sniffed(how: Format, path: Path, head: bytes) -> bool:
+    """Return whether a format recognises a file; where it fails, reading the file will say so."""
+    try:
+        return how.sniff(path, head)
+    except FormatError:
+        return path.suffix.lower() in how.suffixes
 
 
 def _possible(file: Path) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ else:
     pa = Later("pyarrow")
     pq = Later("pyarrow.parquet")
 
-VERSION = 4
+VERSION = 5
 """Of the index and of the catalogue's rows: a change of either counts on."""
 FRESH_NS = 2_000_000_000
 """Age below which a change may not show in a time stamp: some disks count in seconds."""
@@ -90,7 +90,7 @@ def catalogue_so_far(
     """
     began_ns, began = time.time_ns(), time.monotonic()
     found = [(campaign, _Listing.of(campaign)) for campaign in store.campaigns()]
-    known = _read_index(store) or _Index(pd.DataFrame())
+    known = _read_index(store) or _Index(_typed([]))
     listed = time.monotonic()
     parts, problems, end = [], [], listed + max(within_s, listed - began)
     for campaign, listing in found:
@@ -357,7 +357,7 @@ def _rebuilt(
             new.names.append(name)
             keys.append(key)
         new.bounds[part.campaign.name] = (first, len(rows), part.listing.sync)
-    table = pd.DataFrame(rows)
+    table = _typed(rows)
     if not rows:
         return table, False
     new.keys = np.array(keys, np.int64).reshape(-1, 2)
@@ -366,6 +366,24 @@ def _rebuilt(
 
 Row = dict[str, str | int | float | None]
 """A trial of the catalogue: its cells by column."""
+_TYPES = {
+    **dict.fromkeys(("campaign", "trial", "experiment", "role"), "str"),
+    **dict.fromkeys(("repetition", "block", "attempt"), "int64"),
+    "simulated": "bool",
+    "recorded_s": "float64",
+    **dict.fromkeys(("events", "frames"), "int64"),
+    "frame_source": "str",
+    "sync_uncertainty_us": "float64",
+    "passed": "bool",
+}
+"""Types of the columns that every catalogue has, also one of no trial."""
+
+
+def _typed(rows: list[Row]) -> pd.DataFrame:
+    """Return rows as a table, columns without any value as those of numbers that are missing."""
+    table = pd.DataFrame(rows, columns=None if rows else list(_TYPES))
+    empty = dict.fromkeys(table.columns[table.isna().all()], "float64") if rows else {}
+    return table.astype({**empty, **_TYPES})
 
 
 def _row(campaign: str, recording: Recording) -> Row:

@@ -25,7 +25,9 @@ import numpy as np
 from sliplab.storage.errors import StoreError, disk_fault, own_fault
 from sliplab.storage.streams import (
     I64,
+    MOST_COLUMNS,
     SCALAR,
+    STREAM_NAME,
     Chunk,
     ClockReads,
     Column,
@@ -41,7 +43,6 @@ from sliplab.storage.trials.hdf5_writer import (
     KIND_ATTRIBUTE,
     OFFSET,
     STREAM_GROUP,
-    STREAM_NAME,
     STREAMS,
     TIMES,
     TIMING,
@@ -253,8 +254,8 @@ class RowFile:
         if kind in STREAMS or not kind:
             return list(STREAMS[kind].columns) if kind else []
         group = self._group(f"{STREAM_GROUP}/{name}")
-        if group.get_num_objs() > MOST_STREAMS:
-            raise NotOurs(f"{self.path}: stream '{name}' has more than {MOST_STREAMS} columns")
+        if group.get_num_objs() > MOST_COLUMNS:
+            raise NotOurs(f"{self.path}: stream '{name}' has more than {MOST_COLUMNS} columns")
         found = [part.decode("utf-8", "replace") for part in group]
         for part in found:
             if not STREAM_NAME.fullmatch(part):

@@ -19,7 +19,6 @@ with an index that ends before the last event.
 from __future__ import annotations
 
 import os
-import re
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -42,6 +41,7 @@ from sliplab.storage.streams import (
     PULSES,
     READS,
     SCALAR,
+    STREAM_NAME,
     TRIGGERS,
     WRENCH,
     Chunk,
@@ -111,7 +111,6 @@ STREAMS = {kind.name: kind for kind in (WRENCH, SCALAR)}
 """Kinds of SlipLab's own named streams, by name. A named stream is the group ``streams/NAME`` with
 its kind as an attribute, only there once something came. Kinds of other packages are read by what
 the group says."""
-STREAM_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 STREAM_GROUP, KIND_ATTRIBUTE, UNIT_ATTRIBUTE = "streams", "kind", "unit"
 _GROUP_OF = {(device, kind.name): group for group, (device, kind) in (GROUPS | LATE_GROUPS).items()}
 INDEX, OFFSET = "ms_to_idx", "t_offset"

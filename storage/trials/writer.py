@@ -17,7 +17,7 @@ from pathlib import Path
 from sliplab.storage.errors import masked
 from sliplab.storage.files import protect, sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.streams import Chunk, FrameChunk, Json
+from sliplab.storage.streams import STREAM_NAME, Chunk, FrameChunk, Json
 from sliplab.storage.trials.checksums import (
     CHECKSUMS,
     DATA,
@@ -31,7 +31,7 @@ from sliplab.storage.trials.checksums import (
     stream_file,
 )
 from sliplab.storage.trials.frame_writer import FrameWriter
-from sliplab.storage.trials.hdf5_writer import OWN_DEVICES, STREAM_NAME, StreamFile
+from sliplab.storage.trials.hdf5_writer import OWN_DEVICES, StreamFile
 from sliplab.storage.trials.prefix_journal import PrefixJournal, drop_journal
 
 

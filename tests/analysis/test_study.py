@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -171,3 +173,28 @@ def test_lists_in_lists_become_tables_with_the_cells_above_them() -> None:
     ]
     assert [row["name"] for row in found["worlds"]] == ["w1", "w2"]
     assert set(found) == {"detectors", "detectors.figures", "worlds"}
+
+
+def test_args_of_the_docstring_are_the_help_of_options(tmp_path: Path) -> None:
+    def measure(skip: int = 0, most: int = 3) -> Finding[Rates]:
+        """Measure rates.
+
+        Of every trial.
+
+        Args:
+            skip: trials to leave out
+                first.
+            most: trials at most.
+
+        Raises:
+            StoreError: there is none.
+        """
+        raise NotImplementedError
+
+    made = CliRunner().invoke(study_app(replace(study(tmp_path), measure=measure)), ["--help"])
+    shown = " ".join(made.output.replace("│", " ").split())
+    assert "Measure rates. Of every trial." in shown
+    assert re.search(r"--skip <int> Trials to leave out first\.", shown)
+    assert re.search(r"--most <int> Trials at most\.", shown)
+    assert "Args:" not in shown
+    assert "StoreError" not in shown

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 import json
 import math
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -181,7 +183,12 @@ def test_every_argument_of_a_wrong_type_is_named(name: str) -> None:
 
 
 def test_wrong_arguments_are_named_with_what_is_right(store: sliplab.Store, tmp_path: Path) -> None:
-    trial = store.trial(FIRST)
+    trial, model = store.trial(FIRST), sliplab.load_model(store.models()[0])
+    record = trial.recording.record.model_copy(update={"steps": ()})
+    still = sliplab.Trial(
+        store._store, "small", SimpleNamespace(record=record, folder=trial.recording.folder)
+    )
+    empty = sliplab.Store(TrialStore.create(tmp_path / "empty"))
     for call, words in {
         lambda: loose(sliplab).open_store(None): "place: must be text or a path",
         lambda: sliplab.load_model(tmp_path / "none.pt"): "none.pt: cannot be read: No such file",
@@ -206,6 +213,15 @@ def test_wrong_arguments_are_named_with_what_is_right(store: sliplab.Store, tmp_
         lambda: trial.events(-(10**30)): f"start_ns = {-(10**30)}: must fit 64 bits",
         lambda: trial.events(0, 10**30): f"end_ns = {10**30}: must fit 64 bits",
         lambda: trial.step("slid"): "phase = slid: must be one of approach,",
+        lambda: still.step("slide"): "phase = slide: is not there: there is none",
+        lambda: loose(model).counts_of(
+            trial.events(), 0
+        ): "start_ns: must be an array of shape (n,)",
+        lambda: loose(model).counts_of(trial.events(), [[0]]): "not (1, 1)",
+        lambda: store.export("labels", tmp_path / "a.csv", "small", campaign="again"): (
+            "--campaign = again: is no campaign of"
+        ),
+        lambda: empty.export("labels", tmp_path / "a.csv", "pilot"): "campaigns: none; ",
     }.items():
         with pytest.raises(sliplab.InputError) as caught:
             call()
@@ -356,3 +372,32 @@ def test_a_notebook_shows_tables_and_figures(store: sliplab.Store) -> None:
         svg = shown.plot()._repr_svg_()
         assert svg.startswith("<svg")
         assert ("simulated" in svg) == (shown is not plan)
+
+
+def test_the_own_network_comes_first_and_is_named(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    shutil.copy(folder / "store.json", tmp_path)
+    for name in ("paper-seed0", "seed10", "seed2", "seed0"):
+        shutil.copy(folder / "models" / "seed0.pt", tmp_path / "models" / f"{name}.pt")
+    paths = sliplab.open_store(tmp_path).models()
+    assert [path.stem for path in paths] == ["seed0", "seed2", "seed10", "paper-seed0"]
+    assert repr(sliplab.load_model(paths[-1])).startswith("<Model paper-seed0.pt of no slip,")
+
+
+def test_a_disk_that_refuses_is_an_error_of_the_store(
+    store: sliplab.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, "read-only", "/store/report")
+
+    monkeypatch.setattr(api.Store, "_run", refuse)
+    with pytest.raises(sliplab.StoreError, match=r"^/store/report: its disk is read-only: fix"):
+        store.report()
+
+
+def test_scores_name_the_extra_that_is_missing(
+    store: sliplab.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ModuleNotFoundError, match="parquet"):
+        store.scores()

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import sliplab
+from sliplab.analysis import problem
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.evaluation.networks import STEP, retained
-from sliplab.flows.running.console import plain
+from sliplab.flows.window_checks import window_checks
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import TrialStore
 from tests.command_line import here
@@ -53,7 +55,7 @@ def test_own_predictions_give_the_figures_of_the_network(
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     for key in ("accuracy", "interval", "latency_ms", "lead_ms", "margin", "false_alarms"):
-        assert json.loads(json.dumps(expected[key], default=plain)) == found[key], key
+        assert expected[key] == found[key], key
     assert found["accuracy"]["n"] == store.windows("test")["label"].notna().sum()
     assert stored(store, "predictions-ours") == stored(store, f"model-{store.models()[0].stem}")
     # again there is nothing to do
@@ -83,15 +85,47 @@ def test_probabilities_and_classes_are_judged_by_any_lead(
     names = ["no_slip", "incipient", "gross"]
     columns = {name: shares[:, k] for k, name in enumerate(names)}
     by_probability = store.evaluate(predictions=own[["trial", "start_ns"]].assign(**columns))
-    strict = store.evaluate(predictions=own, margin=0)["accuracy"].strict
+    strict = store.evaluate(predictions=own, margin=0)["accuracy"]["strict"]
     assert set(by_probability["margin"].values()) == {0.0}
-    assert by_probability["accuracy"].strict == by_probability["accuracy"].margin == strict
+    assert by_probability["accuracy"]["strict"] == by_probability["accuracy"]["margin"] == strict
     truth = store.windows("test")["label"]
     perfect = own[["trial", "start_ns"]].assign(**{"class": truth.fillna("no_slip")})
     found = store.evaluate(predictions=perfect)
-    assert found["accuracy"].strict == found["accuracy"].argmax == 1
+    assert found["accuracy"]["strict"] == found["accuracy"]["argmax"] == 1
     with pytest.raises(sliplab.InputError, match="--margin = 2: must be a fraction from 0 to 1"):
         store.evaluate(predictions=perfect, margin=2)
+
+
+def test_margin_counts_by_the_outputs_of_the_model(
+    store: sliplab.Store, own: pd.DataFrame, tmp_path: Path
+) -> None:
+    outputs = own.attrs["outputs_per_class"]
+    (usual,) = store.evaluate(predictions=own)["margin"].values()
+    twice = own.copy()
+    twice.attrs["outputs_per_class"] = 2 * outputs
+    twice.to_parquet(tmp_path / "twice.parquet")
+    for given, margin in {"table": twice, "file": tmp_path / "twice.parquet"}.items():
+        (found,) = store.evaluate(predictions=margin)["margin"].values()
+        assert found == 2 * usual, given
+    twice.attrs["outputs_per_class"] = "many"
+    assert store.evaluate(predictions=twice)["margin"] == {"small": usual}
+
+
+def test_another_problem_is_refused_by_its_name(
+    store: sliplab.Store, own: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    force = SimpleNamespace(name="force", of_slip=False)
+    monkeypatch.setattr(problem, "problem_of", lambda *_: force)
+    for call in (
+        store.windows,
+        store.torch_dataset,
+        store.tonic_dataset,
+        lambda: store.evaluate(predictions=own),
+        lambda: store.evaluate(model=store.models()[0]),
+        lambda: window_checks(TrialStore.open(store.folder), collected(store._store)),
+    ):
+        with pytest.raises(sliplab.StoreError, match="show force, and this is about slip"):
+            call()
 
 
 FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {

@@ -286,12 +286,17 @@ class _Trial:
             columns = reader.stream(name)
             units = {part: reader.column_unit(name, part) for part in columns}
         times = self._line(name, columns["t"]).tolist()
-        shown = [part for part, values in columns.items() if values.dtype == np.float64]
-        channels = [self._channel(f"/{name}/{part}", ros2.SCALAR) for part in shown]
+        shown = []
+        for part, values in columns.items():
+            if values.dtype.kind != "f":
+                continue
+            components = values.reshape(len(times), -1).T.astype(np.float64).tolist()
+            for index, component in enumerate(components):
+                topic = f"/{name}/{part}" + (f"/{index}" if values.ndim > 1 else "")
+                shown.append((self._channel(topic, ros2.SCALAR), component, units[part]))
         for row, t_ns in enumerate(times):
-            for channel, part in zip(channels, shown, strict=True):
-                value = float(columns[part][row])
-                yield t_ns, channel, ros2.scalar(t_ns, name, value, units[part])
+            for channel, component, unit in shown:
+                yield t_ns, channel, ros2.scalar(t_ns, name, component[row], unit)
 
     def _pulses(self, group: str, device: str) -> Iterator[Message]:
         with self.recording.open() as reader:

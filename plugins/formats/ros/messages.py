@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.storage.formats.foreign import FormatError
-from sliplab.storage.streams import U8, EventChunk
+from sliplab.storage.streams import MOST_RANK, NUMBERS, U8, EventChunk
 
 EVENTS, IMAGE, POSE, WRENCH = (
     "event_camera_msgs/msg/EventPacket",
@@ -227,6 +227,9 @@ class Image:
         return Image(fields.t_ns, rows[:, :width])
 
 
+_NUMBERS = frozenset(np.dtype(name).newbyteorder("<").str for name in NUMBERS)
+
+
 @dataclass(frozen=True)
 class RowsMessage:
     """A message of ours: rows of a column of one of the trial's files."""
@@ -241,9 +244,9 @@ class RowsMessage:
         """Read one. Raises FormatError where it is damaged."""
         fields = Fields(message)
         file, column, unit, kind = (fields.text() for _ in range(4))
-        shape = tuple(fields.number("I") for _ in range(min(fields.number("I"), 5)))
+        shape = tuple(fields.number("I") for _ in range(min(fields.number("I"), MOST_RANK + 1)))
         data = fields.block()
-        if kind not in {"<i8", "|u1", "<f4", "<f8"}:
+        if kind not in _NUMBERS or len(shape) > MOST_RANK:
             raise FormatError(f"holds {column!r:.40} as {kind!r:.40}, which no column is")
         row = np.dtype(kind).itemsize * int(np.prod(shape, dtype=object))
         if row == 0 or len(data) % row:
@@ -253,11 +256,13 @@ class RowsMessage:
 
     def message(self, t_ns: int) -> bytes:
         """Return the message."""
+        values = np.ascontiguousarray(self.values, self.values.dtype.newbyteorder("<"))
+        shape = values.shape[1:]
         cdr = CdrWriter(t_ns, "").text(self.file).text(self.column).text(self.unit)
-        cdr.text(self.values.dtype.str).pack("I", self.values.ndim - 1)
-        for size in self.values.shape[1:]:
+        cdr.text(values.dtype.str).pack("I", len(shape))
+        for size in shape:
             cdr.pack("I", size)
-        return cdr.block(np.ascontiguousarray(self.values).tobytes()).done()
+        return cdr.block(values.tobytes()).done()
 
 
 def event_packet(

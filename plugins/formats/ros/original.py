@@ -27,6 +27,7 @@ from sliplab.storage.streams import (
     EVENTS_KIND,
     FRAMES_KIND,
     SCALAR,
+    STREAM_NAME,
     U8,
     Chunk,
     Column,
@@ -45,7 +46,6 @@ from sliplab.storage.trials.hdf5_writer import (
     LATE_GROUPS,
     OWN_DEVICES,
     STREAM_GROUP,
-    STREAM_NAME,
     STREAMS,
     TIMING,
     TRACKS,
@@ -57,6 +57,8 @@ from sliplab.storage.trials.writer import TrialWriter
 
 Array = npt.NDArray[Any]
 _FRAMES_AT_ONCE = 32
+_TIMES = {part: SCALAR.columns[part] for part in ("t", "host")}
+"""Columns that every named stream has in the same way, where it has them."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,9 @@ class Original:
                 for part, column in STREAMS[stated.kind].columns.items():
                     known[f"{STREAM_GROUP}/{stream}/{part}"] = column
             elif not stated.of_camera and name.startswith(f"{STREAM_GROUP}/{stream}/"):
-                part, dtype = name.rpartition("/")[2], values.dtype.name
-                if STREAM_NAME.fullmatch(part) and dtype in {"int64", "float64"}:
-                    known[name] = Column(part, dtype, (), "")
+                part = name.rpartition("/")[2]
+                if STREAM_NAME.fullmatch(part):
+                    known[name] = _TIMES.get(part) or _as_is(part, values)
         files = {DATA, *(stream_file(name) for name, stated in streams.items() if stated.of_camera)}
         if name not in known or name.startswith("events/") or file not in files:
             raise FormatError(f"holds the column {name!r:.60} of {file!r:.60}, which no trial has")
@@ -170,7 +172,7 @@ class Original:
             return _chunk(data, group, CHUNKS[name])
         parts = {key.rpartition("/")[2]: key for key in data if key.startswith(f"{group}/")}
         columns = {
-            part: Column(part, data[key].dtype.name, (), self.units.get(key, ""))
+            part: _as_is(part, data[key])._replace(unit=self.units.get(key, ""))
             for part, key in parts.items()
         }
         return _chunk(data, group, chunk_type(StreamKind(name, columns)))
@@ -248,6 +250,11 @@ class Original:
         make_folder(campaign.sync_folder)
         saved = self.sync.model_copy(update={"raw": recording.raw_checksum})
         write_json(campaign.sync_file(recording.folder.name), saved.to_json())
+
+
+def _as_is(part: str, values: Array) -> Column:
+    """Return the column of another package's kind that has these values."""
+    return Column(part, values.dtype.name, values.shape[1:], "")
 
 
 def _chunk(data: Mapping[str, Array], group: str, chunk: type[Chunk], **more: str) -> Chunk:

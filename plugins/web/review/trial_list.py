@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from sliplab.analysis.campaigns import Collected, has_plan, need_slip
+from sliplab.analysis.campaigns import Collected, has_plan, refuse_classes
 from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.plugins.web.review.doubt import reasons_for_doubt
@@ -157,7 +157,7 @@ class TrialList:
         items = {name: Collected(found[name]) for name in names}
         slips = {name: item for name, item in items.items() if item.experiment != CLASSES}
         if not slips:
-            need_slip(list(items.values()))
+            refuse_classes(list(items.values()))
         items = slips
         rows: list[ReviewRow] = []
         for item in items.values():

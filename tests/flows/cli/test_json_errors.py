@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Iterator
 from contextlib import suppress
@@ -22,6 +23,7 @@ from sliplab.storage.trials.store import TrialStore
 from tests.analysis.labels.reviewable import Reviewable
 from tests.command_line import SECRET, here
 from tests.conftest import ROOT
+from tests.packages import write_metadata
 
 KEYS = ["file", "key", "value", "message", "exit_code"]
 GONE = "ROOM/nowhere"
@@ -258,3 +260,18 @@ def test_a_pose_beyond_a_limit_is_no_bug_of_the_program() -> None:
     assert (found.trace, found.exit_code) == ("", 1)
     assert "4.1 mm is beyond its limit 3.6 mm" in found.message
     assert "RuntimeWarning" in errors.failure(RuntimeWarning("a bug")).trace
+
+
+def test_fault_in_the_code_of_a_package_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "from json import loads\ndef fail(*_):\n    return loads('{')\n"
+    (tmp_path / "lab_faulty.py").write_text(text)
+    write_metadata(tmp_path, "lab-faulty", {"sliplab.plugins": {"faulty": "lab_faulty:PLUGIN"}})
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ValueError, match="Expecting") as raised:
+        importlib.import_module("lab_faulty").fail()
+    found = errors.failure(raised.value)
+    where = f"the package lab-faulty 1.0 fails in {tmp_path / 'lab_faulty.py'}:3"
+    assert found.message.startswith(f"{where}: JSONDecodeError: Expecting")
+    assert found.trace == ""

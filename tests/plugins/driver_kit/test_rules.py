@@ -92,10 +92,10 @@ def test_another_exception_than_a_rig_error_is_a_finding() -> None:
 
 def test_a_driver_without_a_fake_is_not_tried() -> None:
     silent: FrameCameraDriver = replace(frames.DRIVER, fake=None)
-    with pytest.raises(NotTried, match="example_frames declares no fake"):
+    with pytest.raises(NotTried, match="example_frames declares no `fake`"):
         cases(silent, frames.ExampleFramesSettings())[0]()
     camera = replace(events.DRIVER, fake=None)
-    with pytest.raises(NotTried, match="declares no fake"):
+    with pytest.raises(NotTried, match="declares no `fake`"):
         cases(camera, events.ExampleEventsSettings())[0]()
 
 

@@ -48,17 +48,18 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         (tmp_path / f"{module}.py").write_text(code)
         name, place = point.split(" = ")
         write_metadata(tmp_path, module, {"sliplab.drivers": {name: place}}, "1.2")
-        _forget()
+        forget()
 
-    _forget()
+    forget()
     yield put
-    _forget()
+    forget()
     for name in set(sys.modules) - before:
         if name.startswith("lab_"):
             del sys.modules[name]
 
 
-def _forget() -> None:
+def forget() -> None:
+    """Look for packages with drivers again."""
     listed.cache_clear()
     registry.load_driver.cache_clear()
 

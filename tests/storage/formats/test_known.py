@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.flows.imports import import_data
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plugin import Plugin, Plugins, plugins
 from sliplab.storage.formats import known
@@ -102,6 +103,67 @@ def test_unusable_format_is_named_and_harms_no_other(declare: Any, tmp_path: Pat
         kind_of(tmp_path / "a.tick")
     write_aedat4(tmp_path / "d.aedat4")
     assert kind_of(tmp_path / "d.aedat4") == "aedat4"
+
+
+FAULTY = """
+from sliplab.storage.formats.foreign import ForeignTrial
+from sliplab.storage.formats.format import Format
+
+def sniff(path, head):
+    if b"sniff" in head:
+        raise KeyError("magic")
+    return head.startswith(b"tick")
+
+def read(path, name):
+    text = path.read_text()
+    def events():
+        yield from ()
+        raise OSError("cannot unpack")
+    if "read" in text:
+        raise TypeError("no header")
+    return ForeignTrial(name, path.name, lambda: [][1] if "call" in text else events(), "start")
+
+FAULTY = Format((".tick",), sniff, read)
+"""
+
+
+def test_faults_of_a_reader_leave_the_other_files(declare: Any, tmp_path: Path) -> None:
+    declare(FAULTY, Plugin(formats={"faulty": "lab_ticks:FAULTY"}))
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in ("sniff", "read", "call", "events"):
+        (folder / f"{name}.tick").write_text(f"tick {name}")
+    (folder / "sniff.tick").write_text("tick sniff read")
+    write_aedat4(folder / "good.aedat4")
+    found = import_data(folder, tmp_path / "store", name="a")
+    assert found["imported"] == ["good"]
+    code = "fails in the code of the format faulty (lab_ticks:FAULTY)"
+    assert {each["trial"]: each["reason"] for each in found["failed"]} == {
+        name: f"{folder / name}.tick: {code}: {why}"
+        for name, why in {
+            "call": "IndexError: list index out of range",
+            "events": "OSError: cannot unpack",
+            "read": "TypeError: no header",
+            "sniff": "TypeError: no header",
+        }.items()
+    }
+
+
+@pytest.mark.parametrize("what", ["read_all", "layout"])
+def test_fault_of_a_folders_reader_is_one_line(declare: Any, tmp_path: Path, what: str) -> None:
+    text = """
+from sliplab.storage.formats.format import Format, Layout
+def fail(*_):
+    raise TypeError("of the folder")
+FAULTY = Format(sniff=lambda path, head: path.is_dir(), read_all=fail)
+LAYOUT = Layout(folder=fail)
+"""
+    hooks = {"layout": "lab_ticks:LAYOUT"} if what == "layout" else {}
+    formats = {} if hooks else {"faulty": "lab_ticks:FAULTY"}
+    declare(text, Plugin(formats=formats, hooks=hooks))
+    with pytest.raises(InputError, match=r"\(lab_ticks:[A-Z]+\): TypeError: of the folder"):
+        import_data(tmp_path, tmp_path / "store", name="a")
+    assert not (tmp_path / "store").exists()
 
 
 @pytest.mark.long

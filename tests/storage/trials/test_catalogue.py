@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, write_json, write_text
 from sliplab.storage.trials import catalogue as module
 from sliplab.storage.trials.catalogue import (
+    _TYPES,
+    _typed,
     catalogue,
     catalogue_so_far,
     check_table_path,
@@ -242,7 +245,22 @@ def test_table_is_written_into_a_folder_that_is_missing(suffix: str, tmp_path: P
 
 def test_an_empty_store_has_an_empty_catalogue(tmp_path: Path) -> None:
     campaign(tmp_path / "s")
-    assert len(catalogue(TrialStore.open(tmp_path / "s"))) == 0
+    store = TrialStore.open(tmp_path / "s")
+    assert len(catalogue(store)) == 0
+    assert len(query(catalogue(store), "events > 0")) == 0
+
+
+def test_columns_have_the_same_types_in_every_store(where: Any, tmp_path: Path) -> None:
+    none, some = TrialStore.create(tmp_path / "none"), TrialStore.open(where.folder.parents[1])
+    known, fields = catalogue(some), []
+    rows = known.to_dict("records")
+    without = _typed([{**row, "sync_uncertainty_us": None, "x": None} for row in rows])
+    for number, table in enumerate((known, without, catalogue(none))):
+        write_table(table, tmp_path / f"{number}.parquet")
+        schema = pq.read_schema(tmp_path / f"{number}.parquet")
+        fields.append({name: str(schema.field(name).type) for name in _TYPES})
+        assert "null" not in map(str, schema.types)
+    assert fields[0] == fields[1] == fields[2]
 
 
 def test_no_table_replaces_a_file_of_a_store(tmp_path: Path) -> None:
