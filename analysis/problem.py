@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from sliplab.analysis.campaigns import (
@@ -72,9 +73,13 @@ class Problem(ABC):
 
     Attributes:
         name: of its evaluation among the results of the step.
+        units: of numbers of its own in the table of scores, by key, such as ``{"rmse_n": "N"}``.
+        splits: by key of its numbers, the part of the split that they are about.
     """
 
     name: ClassVar[str]
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    splits: ClassVar[Mapping[str, str]] = MappingProxyType({})
     labels: StoreLabels
     campaigns: list[Collected]
 
