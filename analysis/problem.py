@@ -229,7 +229,8 @@ class EventProblem(Problem):
                 state=begun(model),
                 classes=model.classes or CLASSES,
             )
-        _keep(model, fitted, ModelSamples(train=len(train), validation=len(validation)))
+        samples = ModelSamples(train=len(train), validation=len(validation))
+        _keep(model, fitted, samples, simulated=self.labels.store.simulated)
         messages = [f"warning: {warning}" for warning in fitted.warnings]
         if model.classes:
             messages.append(
@@ -240,7 +241,9 @@ class EventProblem(Problem):
 
 
 @uninterrupted
-def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) -> None:
+def _keep(
+    model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples, *, simulated: bool
+) -> None:
     """Write a network and its description, and delete the states of its training."""
     model_file.save(model.path, fitted)
     info = TrainedModel(
@@ -254,6 +257,7 @@ def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) ->
             margin=fitted.chosen.val_margin,
         ),
         warnings=fitted.warnings,
+        simulated=simulated,
     )
     write_json(model.info_path, info.to_json())
     for left in model.path.parent.glob(f"{model.path.stem}.*.state"):

@@ -296,10 +296,12 @@ def _of_seeds(name: str, ours: Rows, theirs: Rows, over: tuple[Rows, Rows] | Non
         over: of different trials, the figure of one network with its interval over them.
     """
     a, b = _values(ours), _values(theirs)
-    if not np.isfinite([*a, *b]).all() or (noise := between_seeds(a, b)) is None:
+    if not np.isfinite([*a, *b]).all() or max(len(a), len(b)) < 2:
         return None
+    both, noise = (float(a.mean()), float(b.mean())), between_seeds(a, b)
+    if noise is None:
+        return _changed(name, ours, both, None, "none")
     below, above = (noise, noise) if over is None else _reach(over[0], over[1], noise)
-    both = float(a.mean()), float(b.mean())
     return _around(name, ours, both, below, above, "seeds" if over is None else "seeds and trials")
 
 
