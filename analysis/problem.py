@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from sliplab.analysis.campaigns import (
@@ -73,10 +74,14 @@ class Problem(ABC):
     Attributes:
         name: of its evaluation among the results of the step.
         of_slip: its trials are those of slip, which windows, predictions and detectors are about.
+        units: of numbers of its own in the table of scores, by key, such as ``{"rmse_n": "N"}``.
+        splits: by key of its numbers, the part of the split that they are about.
     """
 
     name: ClassVar[str]
     of_slip: ClassVar[bool] = False
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    splits: ClassVar[Mapping[str, str]] = MappingProxyType({})
     labels: StoreLabels
     campaigns: list[Collected]
 
@@ -226,7 +231,8 @@ class EventProblem(Problem):
                 state=begun(model),
                 classes=model.classes or CLASSES,
             )
-        _keep(model, fitted, ModelSamples(train=len(train), validation=len(validation)))
+        samples = ModelSamples(train=len(train), validation=len(validation))
+        _keep(model, fitted, samples, simulated=self.labels.store.simulated)
         messages = [f"warning: {warning}" for warning in fitted.warnings]
         if model.classes:
             messages.append(
@@ -237,7 +243,9 @@ class EventProblem(Problem):
 
 
 @uninterrupted
-def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) -> None:
+def _keep(
+    model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples, *, simulated: bool
+) -> None:
     """Write a network and its description, and delete the states of its training."""
     model_file.save(model.path, fitted)
     info = TrainedModel(
@@ -251,6 +259,7 @@ def _keep(model: ModelOnDisk, fitted: training.Fitted, samples: ModelSamples) ->
             margin=fitted.chosen.val_margin,
         ),
         warnings=fitted.warnings,
+        simulated=simulated,
     )
     write_json(model.info_path, info.to_json())
     for left in model.path.parent.glob(f"{model.path.stem}.*.state"):

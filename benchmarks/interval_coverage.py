@@ -1,6 +1,6 @@
-"""Coverage of intervals of clustered data: alarm rates, and medians over worlds.
+"""Coverage of intervals: rates of alarms, medians over worlds, shares, differences of counts.
 
-`python -m benchmarks.interval_coverage [--draws N]` prints both tables. Each row draws data sets
+`python -m benchmarks.interval_coverage [--draws N]` prints all tables. Each row draws data sets
 from a known truth and counts in how many the 95 % interval holds it, with the exact 95 % interval
 of that share.
 """
@@ -14,7 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.metrics.intervals import exact_interval, median_interval, rate_interval
+from sliplab.analysis.metrics.intervals import (
+    count_difference,
+    exact_interval,
+    median_interval,
+    rate_interval,
+    share_interval,
+)
 
 SEED = 44
 TRIAL_H = 48 / 3600
@@ -25,6 +31,7 @@ NUISANCES, REPETITIONS, ALARMED = 39, 4, 6
 """Conditions of `protocols/nuisances.yaml`, trials of each, and conditions that have all alarms."""
 
 Counts = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float64]
 Draw = Callable[[np.random.Generator, npt.NDArray[np.float64]], Counts]
 
 
@@ -35,7 +42,7 @@ class IntervalCoverage:
     Attributes:
         case: what is drawn. clusters: trials or worlds of a data set.
         draws: data sets. held: of them, those whose interval holds the truth.
-        width: median width in units of the truth.
+        width: median width in units of the truth; of shares in points.
     """
 
     case: str
@@ -146,14 +153,75 @@ def medians_by_world(
             yield IntervalCoverage(case, size, draws, held, float(np.median(widths)))
 
 
+WINDOWS = 150
+"""Of a trial."""
+SHARES: dict[str, tuple[Callable[[np.random.Generator, int], FloatArray], float]] = {
+    "shares of trials, beta(18, 1)": (lambda rng, n: rng.beta(18, 1, n), 18 / 19),
+    "5 % of trials at 30 %, others at 98 %": (
+        lambda rng, n: np.where(rng.random(n) < 0.05, 0.3, 0.98),
+        0.05 * 0.3 + 0.95 * 0.98,
+    ),
+}
+"""Shares of trials, and the share of all windows."""
+
+
+def shares_of_windows(
+    draws: int = 1000, sizes: Sequence[int] = (6, 12, 20, 36, 132)
+) -> Iterator[IntervalCoverage]:
+    """Cover the share of windows that are right, of trials with shares of their own.
+
+    Args:
+        draws: data sets of each row. sizes: numbers of trials.
+    """
+    for size in sizes:
+        windows = np.full(size, WINDOWS)
+        for case, (draw, truth) in SHARES.items():
+            rng = np.random.default_rng(SEED)
+            found = (
+                share_interval(rng.binomial(WINDOWS, draw(rng, size)), windows)
+                for _ in range(draws)
+            )
+            yield _covered(case, size, truth, [span or (0.0, 1.0) for span in found])
+
+
+def differences_of_counts(
+    draws: int = 1000, sizes: Sequence[int] = (6, 14, 36, 132)
+) -> Iterator[IntervalCoverage]:
+    """Cover the difference of two shares of trials, of the same ones (half alike) or of others.
+
+    Args:
+        draws: data sets of each row. sizes: numbers of trials.
+    """
+    for size in sizes:
+        for p, q in ((0.02, 0.0), (0.05, 0.0), (1.0, 0.95), (0.3, 0.3)):
+            for paired in (False, True):
+                rng, spans = np.random.default_rng(SEED), []
+                for _ in range(draws):
+                    a, b = rng.random((2, size))
+                    b = np.where(paired & (rng.random(size) < 0.5), a, b)
+                    spans.append(count_difference(a < p, b < q, paired=paired) or (-1.0, 1.0))
+                case = f"{p:.0%} less {q:.0%} of {'the same' if paired else 'other'} trials"
+                yield _covered(case, size, p - q, spans)
+
+
+def _covered(
+    case: str, size: int, truth: float, spans: Sequence[tuple[float, float]]
+) -> IntervalCoverage:
+    """Count the intervals that hold a share; their width is in points."""
+    held = sum(low <= truth <= high for low, high in spans)
+    width = 100 * float(np.median(np.diff(spans)))
+    return IntervalCoverage(case, size, len(spans), held, width)
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print all tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.interval_coverage")
     parser.add_argument("--draws", type=int, default=1000, help="data sets of each row")
     draws = parser.parse_args().draws
-    print("| clusters | case | coverage (%) | median width (of the truth) |")
+    print("| clusters | case | coverage (%) | median width (of the truth; of shares: points) |")
     print("| --: | --- | --- | --: |")
-    for rows in (alarm_rates(draws), medians_by_world(draws)):
+    tables = (alarm_rates, medians_by_world, shares_of_windows, differences_of_counts)
+    for rows in (table(draws) for table in tables):
         for row in rows:
             low, high = row.span
             share = f"{100 * row.share:.1f} ({100 * low:.1f} to {100 * high:.1f})"

@@ -69,7 +69,8 @@ def write_scores(problem: Problem, numbers: Json, folder: Path) -> None:
         for item in problem.campaigns
         for trial, _ in item.trials
     }
-    write_table(scores.score_table(numbers, conditions), folder / scores.FILE)
+    table = scores.score_table(numbers, conditions, problem.units, problem.splits)
+    write_table(table, folder / scores.FILE)
 
 
 def _planned_bytes(item: Collected) -> int:

@@ -4,7 +4,7 @@ A row is a window of `analysis.windows.window_table`, and has ``trial`` (with ``
 several have such a trial), ``start_ns`` and one of
 
 - ``class``: name or number of the class;
-- ``no_slip``, ``incipient``, ``gross``: probabilities from 0 to 1, read to a millionth;
+- ``no_slip``, ``incipient``, ``gross``: probabilities that add up to 1, read to a millionth;
 - ``no_slip_spikes``, ``incipient_spikes``, ``gross_spikes``: whole numbers.
 
 Other columns are ignored. The protocol's margin is in spikes; in the others the margin is a share,
@@ -53,6 +53,8 @@ OUTPUTS = "outputs_per_class"
 """Attribute of a table: output neurons of a class, by which the protocol's margin counts."""
 MOST_SPIKES = 1_000_000
 """Spikes of a class in a window that a table may state."""
+ROUNDING = 0.02
+"""By which three probabilities may miss 1, as ones with two digits do."""
 _SCALE: dict[Kind, int] = {"class": 1, "probability": 1_000_000, "spikes": 1}
 _SHOWN = 3
 """Places that a message names of each fault."""
@@ -198,7 +200,9 @@ def _checked(table: pd.DataFrame, where: str) -> tuple[Kind, pd.DataFrame, list[
         most = 1 if kind == "probability" else MOST_SPIKES
         good = ((cells >= 0) & (cells <= most)).all(axis=1)  # NaN is neither
         cells = np.where(good[:, None], cells, 0)
-        right = "must be from 0 to 1"
+        right = "must be from 0 to 1, and add up to 1"
+        if kind == "probability":
+            good &= np.abs(cells.sum(axis=1) - 1) <= ROUNDING
         if kind == "spikes":
             good &= (cells % 1 == 0).all(axis=1)
             right = f"must be whole numbers from 0 to {MOST_SPIKES:,}"

@@ -10,17 +10,22 @@ import numpy.typing as npt
 from sliplab.analysis.metrics.intervals import rate_interval
 from sliplab.storage.schema.evaluation import AlarmRate
 
-ENOUGH = 24
-"""Trials or worlds from which on intervals of rates hold, whatever the rates (`rate_interval`)."""
+ENOUGH = {"alarms": 24, "errors": 36}
+"""Trials or worlds from which on intervals of rates and of shares of windows hold, even where a few
+have most alarms or errors (`rate_interval`, `benchmarks/interval_coverage.py`)."""
 
 
-def few_words(clusters: int) -> str:
-    """Return a warning where so few trials or worlds cannot bound a rate surely; else nothing."""
-    if clusters >= ENOUGH:
+def few_words(clusters: int, counted: str = "alarms") -> str:
+    """Return a warning where so few trials or worlds bound nothing surely; else nothing.
+
+    Args:
+        counted: a key of `ENOUGH`.
+    """
+    if clusters >= ENOUGH[counted]:
         return ""
     return (
-        f"below {ENOUGH} trials or worlds, here {clusters}, such an interval is too narrow where a "
-        "few of them have most alarms"
+        f"below {ENOUGH[counted]} trials or worlds, here {clusters}, such an interval is too "
+        f"narrow where a few of them have most {counted}"
     )
 
 

@@ -4,16 +4,17 @@ The unit of variation is what was independent: the trial, or the world where sev
 one. Windows of a trial, alarms of a trial and slides of a world are not counted. A few trials give
 a poor estimate of their own spread: bootstrapping six trials gives intervals that cover the truth
 in 86 of 100 cases. So means have Student's t, shares the same on log odds, medians and percentiles
-the ranks of the values, counts of trials the exact binomial one, rates of events a gamma
-distribution with the dispersion that is found between trials or worlds, and medians over worlds the
-values at which Student's t accepts that half of each world's values lie below. Of two sets of the
-same trials each trial's difference is taken, so that what they have in common drops out.
+the ranks of the values, counts of trials the exact binomial one and their differences a score
+interval, rates of events a gamma distribution with the dispersion that is found between trials or
+worlds, and medians over worlds the values at which Student's t accepts that half of each world's
+values lie below. Of two sets of the same trials each trial's difference is taken, so that what they
+have in common drops out.
 
 Sources: Student 1908; Welch 1947; Korn and Graubard 1998 (shares of clusters, on log odds); Hutson
 1999 (quantiles, by ranks between whole ones); Clopper and Pearson 1934; Garwood 1936 (counts in a
-time); McCullagh and Nelder 1989 (over-dispersed counts); Satterthwaite 1946; Woodruff 1952 (medians
-of clusters, by the shares below); Efron 1979 (the bootstrap). How often they hold is measured by
-`benchmarks/interval_coverage.py`.
+time); Newcombe 1998 (differences of shares of trials); McCullagh and Nelder 1989 (over-dispersed
+counts); Satterthwaite 1946; Woodruff 1952 (medians of clusters, by the shares below); Efron 1979
+(the bootstrap). How often they hold is measured by `benchmarks/interval_coverage.py`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -63,11 +64,12 @@ def interval(values: Values, statistic: str = "mean", least: float = -np.inf) ->
     Args:
         values: (n,), one a trial; infinite ones have ranks and no mean.
         statistic: a name of `STATISTICS`.
-        least: the smallest value that there can be: no interval reaches below it.
+        least: the smallest value that there can be: no finite end is below it.
 
     Returns:
         None where so few trials bound nothing: below 2, of a median 6, of a 95th percentile 72; and
-        of a mean where all values are equal, so that nothing is known of their spread.
+        of a mean where all values are equal, so that nothing is known of their spread. An end is
+        infinite where infinite values leave it open.
 
     Raises:
         ValueError: NaN, or an infinite value in a mean.
@@ -79,7 +81,10 @@ def interval(values: Values, statistic: str = "mean", least: float = -np.inf) ->
         span = _by_ranks(np.sort(there), _SHARES[statistic])
     else:
         span = mean_interval(there, np.ones(len(there)))
-    return None if span is None else (max(span[0], least), max(span[1], least))
+    if span is None:
+        return None
+    low, high = (end if np.isinf(end) else max(end, least) for end in span)
+    return low, high
 
 
 def mean_interval(sums: Values, sizes: Values) -> Span | None:
@@ -248,7 +253,12 @@ def median_interval(values: Values, clusters: Sequence[Hashable]) -> Span | None
 
 
 def difference(
-    first: Values, second: Values, statistic: str = "mean", *, paired: bool = False
+    first: Values,
+    second: Values,
+    statistic: str = "mean",
+    *,
+    paired: bool = False,
+    comparisons: int = 1,
 ) -> Span | None:
     """The interval of a statistic of `first` less that of `second`.
 
@@ -258,10 +268,12 @@ def difference(
         first, second: (n,) and (m,), one value a trial; NaN where a trial has none. Infinite ones
             have ranks and no mean.
         paired: they are of the same trials in the same order.
+        comparisons: differences of means of which all intervals are to hold at once, in 95 %
+            (Bonferroni).
 
     Returns:
         None where either has too few values: 2 for a mean, 12 for a median, 72 for the 95th
-        percentile; and where it is infinite.
+        percentile; of means where no trial differs from another; and where it is infinite.
 
     Raises:
         ValueError: an infinite value in a mean, or paired sets of different lengths.
@@ -273,21 +285,73 @@ def difference(
     if min((~np.isnan(a)).sum(), (~np.isnan(b)).sum()) < fewest:
         return None
     if statistic == "mean":
-        return _mean_difference(a, b, paired=paired)
+        return _mean_difference(a, b, paired, _TAIL / comparisons)
     of_a = drawn(len(a))
     of_b = of_a if paired else drawn(len(b), _SEED + 1)
     measure = STATISTICS[statistic]
     with warnings.catch_warnings():  # a draw may hold only trials without a value
         warnings.simplefilter("ignore", RuntimeWarning)
         found = measure(a[of_a], axis=1) - measure(b[of_b], axis=1)
-    found = found[~np.isnan(found)]
-    if not len(found):
+    # infinity less infinity may be anything; between two values a quantile of infinite ones is none
+    finite = bool(np.isfinite(found).all())
+    method: Literal["linear", "inverted_cdf"] = "linear" if finite else "inverted_cdf"
+    low, high = (
+        float(np.quantile(np.where(np.isnan(found), anything, found), tail, method=method))
+        for tail, anything in zip(_QUANTILES, (-np.inf, np.inf), strict=True)
+    )
+    return (low, high) if np.isfinite([low, high]).all() else None
+
+
+def count_difference(first: Values, second: Values, *, paired: bool = False) -> Span | None:
+    """Newcombe's hybrid score interval of one share of trials less another, -1..1.
+
+    Wilson's intervals of both shares, joined; of the same trials with the correlation that their
+    table of four counts shows, lessened by its continuity correction (his method 10 of each paper).
+
+    Args:
+        first, second: (n,) and (m,), 1 for a trial that is counted, 0 for another.
+        paired: they are of the same trials in the same order.
+
+    Returns:
+        None without a trial.
+
+    Raises:
+        ValueError: another value, or paired sets of different lengths.
+    """
+    a, b = _checked(first), _checked(second)
+    if not np.isin(np.concatenate([a, b]), (0, 1)).all() or (paired and len(a) != len(b)):
+        raise ValueError("trials must be counted as 0 or 1, of pairs as many in both sets")
+    if not len(a) or not len(b):
         return None
-    if not np.isfinite(found).all():  # between two values a quantile of infinite ones is none
-        low, high = np.quantile(found, _QUANTILES, method="inverted_cdf")
-        return (float(low), float(high)) if np.isfinite([low, high]).all() else None
-    low, high = np.quantile(found, _QUANTILES)
-    return float(low), float(high)
+    (p, low_a, high_a), (q, low_b, high_b) = _wilson(a), _wilson(b)
+    phi = _phi(a, b) if paired else 0.0
+
+    def reach(one: float, other: float) -> float:
+        return float(np.sqrt(max(one**2 - 2 * phi * one * other + other**2, 0.0)))
+
+    return p - q - reach(p - low_a, high_b - q), p - q + reach(high_a - p, q - low_b)
+
+
+def _wilson(counted: FloatArray) -> tuple[float, float, float]:
+    """A share of trials, and Wilson's interval of it."""
+    n, z = len(counted), float(norm.ppf(_QUANTILES[1]))
+    share = float(counted.mean())
+    middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z * np.sqrt(share * (1 - share) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    return share, float(middle - half), float(middle + half)
+
+
+def _phi(a: FloatArray, b: FloatArray) -> float:
+    """The correlation of pairs of 0 and 1, lessened if it is positive; 0 where one is constant."""
+    n = len(a)
+    both, first, second, neither = (
+        float(np.count_nonzero((a == x) & (b == y))) for x, y in ((1, 1), (1, 0), (0, 1), (0, 0))
+    )
+    margins = (both + first) * (second + neither) * (both + second) * (first + neither)
+    if not margins:
+        return 0.0
+    apart = both * neither - first * second
+    return (max(apart - n / 2, 0.0) if apart > 0 else apart) / float(np.sqrt(margins))
 
 
 def share_difference(first: tuple[Values, Values], second: tuple[Values, Values]) -> Span | None:
@@ -297,7 +361,7 @@ def share_difference(first: tuple[Values, Values], second: tuple[Values, Values]
         first, second: hits and windows of each trial, (n,) and (n,), trials in the same order.
 
     Returns:
-        None with fewer than two trials.
+        None with fewer than two trials, or where none differs from another.
 
     Raises:
         ValueError: they are not of the same number of trials.
@@ -309,7 +373,7 @@ def share_difference(first: tuple[Values, Values], second: tuple[Values, Values]
         return None
     (a, of_a), (b, of_b) = (_ratio(hits, sizes) for hits, sizes in pairs)
     half = _half(of_a - of_b)
-    return a - b - half, a - b + half
+    return (a - b - half, a - b + half) if half else None
 
 
 def between_seeds(first: Values, second: Values) -> float | None:
@@ -321,13 +385,15 @@ def between_seeds(first: Values, second: Values) -> float | None:
         first, second: one value a seed.
 
     Returns:
-        None where neither set has two seeds, or a set is empty.
+        None where neither set has two seeds, a set is empty, or no seed differs from another.
     """
     sets = [_checked(first), _checked(second)]
     freedom = sum(len(values) - 1 for values in sets)
     if freedom < 1 or min(map(len, sets)) < 1:
         return None
     squares = sum(float(((values - values.mean()) ** 2).sum()) for values in sets)
+    if squares <= 1e-24 * max(float((values**2).sum()) for values in sets):
+        return None
     spread = np.sqrt(squares / freedom * sum(1 / len(values) for values in sets))
     return float(student.ppf(_QUANTILES[1], freedom) * spread)
 
@@ -346,7 +412,7 @@ def _ratio(sums: FloatArray, sizes: FloatArray) -> tuple[float, FloatArray]:
     return mean, (sums - mean * sizes) / total
 
 
-def _half(parts: FloatArray) -> float:
+def _half(parts: FloatArray, tail: float = _TAIL) -> float:
     """Half of Student's interval of a figure that n trials move by `parts`; 0 below two trials.
 
     What rounding leaves of trials that are all equal is not a spread.
@@ -355,10 +421,10 @@ def _half(parts: FloatArray) -> float:
     if n < _FEWEST or np.abs(parts).max() <= 1e-12 * max(1.0, float(np.abs(parts).sum())):
         return 0.0
     error = np.sqrt(n / (n - 1) * float((parts**2).sum()))
-    return float(student.ppf(_QUANTILES[1], n - 1) * error)
+    return float(student.ppf(1 - tail, n - 1) * error)
 
 
-def _mean_difference(a: FloatArray, b: FloatArray, *, paired: bool) -> Span:
+def _mean_difference(a: FloatArray, b: FloatArray, paired: bool, tail: float) -> Span | None:
     here, there = (np.isfinite(part) for part in (a, b))
     (mean_a, of_a), (mean_b, of_b) = (
         _ratio(np.where(known, part, 0.0), known.astype(np.float64))
@@ -366,15 +432,15 @@ def _mean_difference(a: FloatArray, b: FloatArray, *, paired: bool) -> Span:
     )
     gap = mean_a - mean_b
     if paired:
-        half = _half((of_a - of_b)[here | there])
-        return gap - half, gap + half
+        half = _half((of_a - of_b)[here | there], tail)
+        return (gap - half, gap + half) if half else None
     # Welch: each set's squared error, and the degrees of freedom that fit their sum
     n, m = int(here.sum()), int(there.sum())
     squares = [float((of_a**2).sum()) * n / (n - 1), float((of_b**2).sum()) * m / (m - 1)]
-    if not sum(squares):
-        return gap, gap
+    if not (_half(of_a) or _half(of_b)):
+        return None
     freedom = sum(squares) ** 2 / (squares[0] ** 2 / (n - 1) + squares[1] ** 2 / (m - 1))
-    half = float(student.ppf(_QUANTILES[1], freedom) * np.sqrt(sum(squares)))
+    half = float(student.ppf(1 - tail, freedom) * np.sqrt(sum(squares)))
     return gap - half, gap + half
 
 

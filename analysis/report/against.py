@@ -1,9 +1,9 @@
 """Comparison of two reports: the difference of their tables of scores, and the page.
 
 A difference alone says nothing: another seed, or other trials, would have changed the figure
-as well. So each difference is compared with its expected random variation: the spread between seeds
-if several were trained, otherwise that between trials, paired if both reports evaluated the same
-trials. Both tables contain all inputs.
+as well. So each difference is compared with its expected random variation: that between trials,
+paired if both reports evaluated the same ones, and of means over seeds that between seeds, with
+that between trials if those differ. Both tables contain all inputs.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from sliplab.analysis.metrics.intervals import (
     STATISTICS,
     Span,
     between_seeds,
+    count_difference,
     difference,
     share_difference,
 )
@@ -36,12 +37,13 @@ from sliplab.storage.schema.summary import OneCameraSummary, Summary
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import refuse_url
 
-Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
+Basis = Literal["seeds", "seeds and trials", "same trials", "trials", "intervals", "none"]
 
 PAGE = "against.html"
 SUMMARY = ("report", "summary.json")
 BASES: dict[Basis, str] = {
-    "seeds": "spread between seeds",
+    "seeds": "spread between seeds, on these trials",
+    "seeds and trials": "spread between seeds and between trials",
     "same trials": "the same trials, one by one",
     "trials": "trials, each report's own",
     "intervals": "both intervals over trials",
@@ -84,9 +86,9 @@ _TRIALS = (
         for statistic, word in _WORDS.items()
     ),
     ("lead_ms.min", "lead, smallest", "none"),
-    ("outcome.detected_first", "detected before gross slip", "mean"),
+    ("outcome.detected_first", "detected before gross slip", "counts"),
     *(
-        (f"{key}.{name}", f"{onset} {name.replace('_', ' ')}", "mean")
+        (f"{key}.{name}", f"{onset} {name.replace('_', ' ')}", "counts")
         for key, onset in (("outcome", "incipient"), ("gross", "gross"))
         for name in ("false_early", "missed", "late")
     ),
@@ -108,6 +110,8 @@ FIGURES = (
 """Figures that are compared, by experiment, with what their titles begin with. Of each: its name in
 the table of scores, its title, and the statistic over its rows, or the source of its noise. Of two
 with the same title the first one that both reports have is compared."""
+_OF_CHOSEN = {"seeds.each.strict": "interval", "seeds.each.argmax": "window_intervals.accuracy"}
+"""Figures of seeds, and the chosen network's with its interval over trials."""
 _SETTINGS = ("simulated", "protocols", "detection", "seeds", "versions")
 
 
@@ -205,7 +209,13 @@ def compare(here: Document, there: Document) -> ReportComparison:
             name = beginning + words + (", mean of seeds" if how == "seeds" else who)
             if not ours or not theirs or name in found:
                 continue
-            if how in BASES:
+            if how == "seeds":
+                mine, others = (_trial_rows(table, experiment) for table in tables)
+                one = _OF_CHOSEN.get(figure, figure.removeprefix("by_seed."))
+                x, y = (table.get((experiment, one), ()) for table in tables)
+                over = None if _same_trials(mine, others, *both) else (x, y)
+                change = _of_seeds(name, ours, theirs, over)
+            elif how in BASES:
                 change = _of_figures(name, ours, theirs, how)
             else:
                 change = _of_trials(name, ours, theirs, how, _same_trials(ours, theirs, *both))
@@ -233,6 +243,13 @@ def _by_figure(summary: Json) -> Mapping[tuple[str, str], Rows]:
     return found
 
 
+def _trial_rows(table: Mapping[tuple[str, str], Rows], experiment: str) -> Rows:
+    """Return the rows of an experiment's trials."""
+    return [
+        row for (of, _), rows in table.items() if of == experiment for row in rows if row["trial"]
+    ]
+
+
 def _same_trials(ours: Rows, theirs: Rows, here: Json, there: Json) -> bool:
     """Check that trials were not only called the same, but collected by the same protocol."""
     names = [{(row["campaign"], row["trial"]) for row in rows} for rows in (ours, theirs)]
@@ -240,7 +257,7 @@ def _same_trials(ours: Rows, theirs: Rows, here: Json, there: Json) -> bool:
         {name: part["protocols"].get(name, {}).get("collection") for name, _ in names[0]}
         for part in (here, there)
     ]
-    return names[0] == names[1] and hashes[0] == hashes[1]
+    return bool(names[0]) and names[0] == names[1] and hashes[0] == hashes[1]
 
 
 def _of_trials(name: str, ours: Rows, theirs: Rows, statistic: str, same: bool) -> Change | None:
@@ -256,6 +273,8 @@ def _of_trials(name: str, ours: Rows, theirs: Rows, statistic: str, same: bool) 
         if span is None:
             return None
         return _changed(name, ours, (a @ n / n.sum(), b @ m / m.sum()), span, basis)
+    if counted := statistic == "counts":
+        statistic = "mean"
     if statistic != "median":  # a lost detection has a rank, but no size
         a, b = (np.where(np.isinf(values), np.nan, values) for values in (a, b))
     if not np.isfinite(a).any() or not np.isfinite(b).any():
@@ -263,26 +282,59 @@ def _of_trials(name: str, ours: Rows, theirs: Rows, statistic: str, same: bool) 
     both = [float(STATISTICS[statistic](values, axis=0)) for values in (a, b)]
     if not np.isfinite(both).all() or (ours[0]["unit"] == "share" and not any(both)):
         return None
-    return _changed(name, ours, both, difference(a, b, statistic, paired=same), basis)
+    if counted:
+        span = count_difference(a, b, paired=same)
+    else:
+        span = difference(a, b, statistic, paired=same)
+    return _changed(name, ours, both, span, basis)
+
+
+def _of_seeds(name: str, ours: Rows, theirs: Rows, over: tuple[Rows, Rows] | None) -> Change | None:
+    """Compare means over seeds.
+
+    Args:
+        over: of different trials, the figure of one network with its interval over them.
+    """
+    a, b = _values(ours), _values(theirs)
+    if not np.isfinite([*a, *b]).all() or max(len(a), len(b)) < 2:
+        return None
+    both, noise = (float(a.mean()), float(b.mean())), between_seeds(a, b)
+    if noise is None:
+        return _changed(name, ours, both, None, "none")
+    below, above = (noise, noise) if over is None else _reach(over[0], over[1], noise)
+    return _around(name, ours, both, below, above, "seeds" if over is None else "seeds and trials")
 
 
 def _of_figures(name: str, ours: Rows, theirs: Rows, how: str) -> Change | None:
-    """Compare figures over all trials, of every trained seed or of one."""
+    """Compare figures over all trials."""
     a, b = _values(ours), _values(theirs)
     if not np.isfinite([*a, *b]).all():
         return None
-    both = [float(values.mean()) for values in (a, b)]
+    both = float(a.mean()), float(b.mean())
     if how == "none":
         return _changed(name, ours, both, None, "none")
-    basis: Basis = "seeds" if how == "seeds" else "intervals"
-    if basis == "seeds":
-        noise = between_seeds(a, b)
-    else:
-        noise = math.hypot(*((of[0]["high"] - of[0]["low"]) / 2 for of in (ours, theirs)))
-    if noise is None or not math.isfinite(noise):
-        return None
+    return _around(name, ours, both, *_reach(ours, theirs), "intervals")
+
+
+def _reach(ours: Rows, theirs: Rows, *further: float) -> tuple[float, float]:
+    """Return how far a difference reaches below and above itself, by both figures' intervals.
+
+    The distances to their ends are added in squares (Zou and Donner 2008), with `further` ones.
+    """
+    if not ours or not theirs:
+        return math.nan, math.nan
+    here, there = ours[0], theirs[0]
+    below = here["value"] - here["low"], there["high"] - there["value"]
+    above = here["high"] - here["value"], there["value"] - there["low"]
+    return math.hypot(*below, *further), math.hypot(*above, *further)
+
+
+def _around(
+    name: str, rows: Rows, both: Sequence[float], below: float, above: float, basis: Basis
+) -> Change:
     gap = both[0] - both[1]
-    return _changed(name, ours, both, (gap - noise, gap + noise), basis)
+    known = math.isfinite(below) and math.isfinite(above)
+    return _changed(name, rows, both, (gap - below, gap + above) if known else None, basis)
 
 
 def _values(rows: Rows) -> npt.NDArray[np.float64]:

@@ -68,13 +68,13 @@ def slip_answer(summary: Summary | OneCameraSummary) -> Answer:
         )
     if not groups:
         return Answer((), None)
-    shown = (TIMES[1], TIMES[3])
+    shown, rules = (TIMES[1], TIMES[3]), list(summary.detection.values())
     return Answer(
         sentences,
-        draw_times(groups, shown, (), "answer", summary.simulated),
+        draw_times(groups, shown, (), rules, "answer", summary.simulated),
         "Time from the labelled onset of incipient slip to its detection (left), and from there to "
-        "gross slip (right). A dot is a trial, the diamond the mean, the bar its 95 % interval; at "
-        "the right end trials without a value, and why.",
+        "gross slip (right). A dot is a trial, the diamond the mean, the bar its 95 % interval (an "
+        "arrow: cut off); at the right end trials without a value, and why.",
     )
 
 

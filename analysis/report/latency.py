@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +17,12 @@ from sliplab.analysis.report.figures.intervals import Panel, by_condition
 from sliplab.analysis.report.figures.style import BLUE, FIRST_SLIP, GREEN, ORANGE, RED
 from sliplab.analysis.report.outcomes import (
     CAUSE,
-    LEAST,
     OUTCOMES,
     TIMES,
     WORDS,
     Conditions,
+    Rule,
+    least_ms,
     times,
 )
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent, with_interval
@@ -66,7 +69,10 @@ _SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_o
 
 @dataclass(frozen=True)
 class FactorTrend:
-    """Change of a time's mean from a factor's first to its last level, with its interval."""
+    """Change of a time's mean from a factor's first to its last level.
+
+    Its interval is one of those that hold all changes of a section at once.
+    """
 
     first: str
     last: str
@@ -144,6 +150,7 @@ def latency_section(
         for item in campaigns
         if item.experiment == experiment and item.name in summary.detection
     ]
+    judged_by = list(summary.detection.values())
     shown = TIMES[1:3] if kinematic else TIMES
     kinds = ("incipient", "gross") if kinematic else ("incipient", "gross", "lead")
     return LatencySection(
@@ -153,13 +160,13 @@ def latency_section(
         by,
         late,
         sorted({choice_note(rule) for rule in rules} - {""}),
-        {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
+        _trends(found, shown),
         clocks.latency_note(summary.sync, summary.labels),
         clocks.figure_note(summary.sync),
-        _figures(numbers, experiment, found, by, summary.simulated),
+        _figures(experiment, found, by, judged_by, numbers.first_slip_ms, summary.simulated),
         _statistics(numbers, kinds),
         _accounts(experiment, numbers.accounted),
-        [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
+        [] if kinematic else [_by_level(found, factor, judged_by) for factor in found.varied()],
         _by_seed(numbers, kinds),
     )
 
@@ -203,10 +210,15 @@ def choice_note(chosen_by: str) -> str:
 
 
 def _figures(
-    numbers: Experiment, experiment: str, found: Conditions, by: Sequence[str], simulated: bool
+    experiment: str,
+    found: Conditions,
+    by: Sequence[str],
+    rules: Sequence[Rule],
+    first_slip_ms: float | None,
+    simulated: bool,
 ) -> list[Figure]:
     """Draw the experiment's times by condition."""
-    draw = partial(draw_times, simulated=simulated, first_slip_ms=numbers.first_slip_ms)
+    draw = partial(draw_times, rules=rules, simulated=simulated, first_slip_ms=first_slip_ms)
     if experiment == "kinematic":
         groups, breaks = {"all test trials": found.trials}, []
         for factor in by:
@@ -229,6 +241,7 @@ def draw_times(
     shown: Sequence[str],
     breaks: Sequence[int],
     name: str,
+    rules: Sequence[Rule],
     simulated: bool,
     first_slip_ms: float | None = None,
 ) -> Figure:
@@ -239,6 +252,7 @@ def draw_times(
         shown: which of `TIMES`.
         breaks: rows that begin a new group.
         name: of the figure.
+        rules: as of `least_ms`.
         first_slip_ms: as of an `Experiment`.
     """
     panels = []
@@ -249,7 +263,8 @@ def draw_times(
         limit = None
         if time == "latency_incipient_ms" and first_slip_ms is not None:
             limit = first_slip_ms, FIRST_SLIP
-        panels.append(Panel(label, values, colour, zero, notes, LEAST[time], limit))
+        least = least_ms(time, rules)
+        panels.append(Panel(label, values, colour, zero, notes, least, limit))
     svg = by_condition(list(groups), panels, simulated=simulated, breaks=breaks)
     trials = [(row, trial) for row, found in groups.items() for trial in found]
     data: dict[str, list[object]] = {
@@ -271,29 +286,33 @@ def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:
     return ", ".join(f"{causes.count(k)} {word}" for k, word in _SHORT.items() if k in causes)
 
 
-def _trends(found: Conditions, name: str) -> list[FactorTrend]:
-    """Compare the means at each factor's first and last level."""
-    trends = []
-    for factor in found.varied():
+def _trends(found: Conditions, names: Sequence[str]) -> dict[str, list[FactorTrend]]:
+    """Compare the means at each factor's first and last level, by time."""
+    pairs = []
+    for name, factor in itertools.product(names, found.varied()):
         levels = found.factors[factor]
         if len(levels) < 2 or levels[0].endswith(" deg"):  # an angle has no first and last
             continue
         first, last = (times(found.at(**{factor: levels[k]}), name) for k in (0, -1))
-        span = difference(last, first)
-        if span is not None:
-            change = sum(last) / len(last) - sum(first) / len(first)
-            trends.append(FactorTrend(levels[0], levels[-1], change, *span))
+        if difference(last, first) is not None:
+            pairs.append((name, levels, first, last))
+    trends: dict[str, list[FactorTrend]] = {}
+    for name, levels, first, last in pairs:
+        low, high = difference(last, first, comparisons=len(pairs)) or (math.nan, math.nan)
+        change = sum(last) / len(last) - sum(first) / len(first)
+        trend = FactorTrend(levels[0], levels[-1], change, low, high)
+        trends.setdefault(NAMES[name], []).append(trend)
     return trends
 
 
-def _by_level(found: Conditions, factor: str) -> Table:
-    rows = []
+def _by_level(found: Conditions, factor: str, rules: Sequence[Rule]) -> Table:
+    rows, least = [], [least_ms(name, rules) for name in TIMES]
     for text in found.factors[factor]:
         there = found.at(**{factor: text})
         known = [times(there, name) for name in TIMES]
         means = [
-            with_interval(sum(of) / len(of) if of else None, interval(of, least=LEAST[name]), 0)
-            for name, of in zip(TIMES, known, strict=True)
+            with_interval(sum(of) / len(of) if of else None, interval(of, least=end), 0)
+            for end, of in zip(least, known, strict=True)
         ]
         rows.append([text, str(len(there)), *means])
     columns = [factor, "trials", *(f"{NAMES[name]} (ms)" for name in TIMES)]

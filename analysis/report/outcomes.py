@@ -25,12 +25,14 @@ from sliplab.storage.schema.evaluation import TrialLatency, TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,
     Outcome,
+    RuleSettings,
     Span,
     TimeIntervals,
     TrialIntervals,
     TrialOutcome,
 )
 
+Rule = Detection | RuleSettings
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 WORDS = {
     "detected_first": "detected before gross slip",
@@ -45,8 +47,6 @@ TIMES = ("duration_ms", "latency_incipient_ms", "latency_gross_ms", "lead_ms")
 """Times of a trial."""
 CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
 """Key of a trial that gives the reason for a missing time."""
-LEAST = {name: 0.0 if name in ("duration_ms", "lead_ms") else -math.inf for name in TIMES}
-"""The least that each can be, ms; latencies reach below zero by the tolerance."""
 
 
 def trial_outcome(row: TrialScore) -> TrialOutcome:
@@ -98,27 +98,37 @@ def account(
     return Accounts(planned=counts.total(), **{name: counts[name] for name in OUTCOMES})
 
 
-def trial_intervals(
-    trials: Sequence[TrialOutcome], rules: Iterable[Detection] = ()
-) -> TrialIntervals:
+def trial_intervals(trials: Sequence[TrialOutcome], rules: Iterable[Rule] = ()) -> TrialIntervals:
     """Return the interval of each time's mean, median and 95th percentile over trials.
 
-    In medians missed and late detections count, see `LatencyFigures`. No interval reaches below
-    what can be: leads and lengths are not negative, and latencies not earlier than the tolerance.
+    In medians missed and late detections count, see `LatencyFigures`.
 
     Args:
-        rules: of detection, with the tolerance of early detections.
+        rules: as of `least_ms`.
     """
-    early_ms = max((rule.false_early_ms for rule in rules), default=math.inf)
-    found = {}
+    rules, found = list(rules), {}
     for name in TIMES:
         there = times(trials, name)
-        least = max(LEAST[name], -early_ms)
+        least = least_ms(name, rules)
         spans: dict[str, Span] = {kind: interval(there, kind, least) for kind in ("mean", "p95")}
         lost = [value for row in trials if (value := lost_ms(vars(row), name)) is not None]
         spans["median"] = median_span(there, len(lost), min(lost, default=math.inf), least)
         found[name] = TimeIntervals(n=len(there), **spans)
     return TrialIntervals(**found)
+
+
+def least_ms(name: str, rules: Iterable[Rule]) -> float:
+    """Return the least that one of `TIMES` can be, ms; no interval of it reaches below.
+
+    Leads and lengths are not negative, and latencies not earlier than the tolerance.
+
+    Args:
+        rules: of detection, with the tolerance of early detections.
+    """
+    if name in ("duration_ms", "lead_ms"):
+        return 0.0
+    early_ms = [rule.false_early_ms for rule in rules if rule.false_early_ms is not None]
+    return -max(early_ms, default=math.inf)
 
 
 def lost_ms(trial: Mapping[str, Any], name: str) -> float | None:

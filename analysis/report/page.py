@@ -248,7 +248,8 @@ def with_interval(
     """Return a value with its 95 % interval; an end that is None is infinite."""
     text = number(value, digits)
     if span is not None:
-        low, high = (number(end, digits) if end is not None else "∞" for end in span)
+        low = "-∞" if span[0] is None else number(span[0], digits)
+        high = "∞" if span[1] is None else number(span[1], digits)
         text = f"{text} ({low} to {high})"
     return f"{text} {unit}".rstrip()
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FILE = "scores.parquet"
+_NONE: Mapping[Any, Any] = MappingProxyType({})
 Row = dict[str, Any]
 """A row, by column."""
 COLUMNS = {
@@ -74,50 +75,67 @@ _UNITS = {
     **dict.fromkeys(("strict", "argmax", "ece", "coverage", "false_early_rate"), "share"),
     **dict.fromkeys(("interval", "window_intervals", "by_factor", "by_tenth"), "share"),
     **dict.fromkeys(("no_slip", "reliability", "baselines", "network_ahead"), "share"),
-    **dict.fromkeys(("by_length", "share", "rates", "outcome"), "share"),
+    **dict.fromkeys(("by_length", "share", "rate", "rates", "outcome"), "share"),
     **dict.fromkeys(("connection_sparsity", "activation_sparsity"), "share"),
     **dict.fromkeys(("seconds", "seconds_collected"), "s"),
     **dict.fromkeys(("bytes", "bytes_collected", "footprint_bytes"), "B"),
     "event_rates": "1/s",
     "false_alarms": "1/h",
     "hours": "h",
+    "levels": "",
 }
+"""Units by key, also of what is inside it; "" where that has none."""
 _COUNTS = {
     *("missed", "late", "false_early", "detected_first", "trials", "windows", "right", "errors"),
-    *("without_onsets", "alarms", "clusters"),
+    *("without_onsets", "alarms", "clusters", "choice"),
+    *("lacking", "early_by_paper", "not_before", "unsure"),
 }
 """Keys without a unit, wherever they are."""
 
 
 def score_table(
-    summary: Json, conditions: Mapping[tuple[str, str], Mapping[str, str]] = MappingProxyType({})
+    summary: Json,
+    conditions: Mapping[tuple[str, str], Mapping[str, str]] = _NONE,
+    units: Mapping[str, str] = _NONE,
+    splits: Mapping[str, str] = _NONE,
 ) -> pd.DataFrame:
     """Return the table of a report's numbers, in their order.
 
     Args:
         summary: as in `summary.json`.
         conditions: levels by factor, by campaign and trial.
+        units, splits: see `score_rows`.
 
     Returns:
         a frame with the `COLUMNS`.
     """
     import pandas as pd
 
-    rows = list(score_rows(summary))
+    rows = list(score_rows(summary, units, splits))
     for row in rows:
         if levels := conditions.get((row["campaign"], row["trial"])):
             row["condition"] = _with({"condition": ""}, levels)["condition"]
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
 
 
-def score_rows(summary: Json) -> Iterator[Row]:
-    """Yield the rows of a report's numbers."""
+def score_rows(
+    summary: Json, units: Mapping[str, str] = _NONE, splits: Mapping[str, str] = _NONE
+) -> Iterator[Row]:
+    """Yield the rows of a report's numbers.
+
+    Args:
+        units: further ones, by a key of the figure's name; they also hold for what is inside.
+        splits: parts of the split that further keys of the summary are about.
+    """
     start: Row = {name: "" for name, kind in COLUMNS.items() if kind == "str"}
     start |= dict.fromkeys(("value", "low", "high"), math.nan)
     start |= {"n": None, "simulated": bool(summary["simulated"])}
     for key, value in summary.items():
         if key not in {*_KNOWN, "seeds"}:
-            yield from _entry({**start, "split": "test" if key in _TESTED else ""}, key, value)
+            split = splits.get(key, "test" if key in _TESTED else "")
+            for row in _entry({**start, "split": split}, key, value):
+                own = (units[of] for of in reversed(row["figure"].split(".")) if of in units)
+                yield {**row, "unit": next(own, row["unit"])}
 
 
 def _entry(at: Row, key: str, value: Any) -> Iterator[Row]:
@@ -233,6 +251,7 @@ def _unit(figure: str) -> str:
     keys = figure.split(".")
     for key in () if keys[-1] in _COUNTS else reversed(keys):
         ending = next((end for end in _ENDINGS if key.endswith(end)), None)
-        if unit := _UNITS.get(key) or _ENDINGS.get(ending or ""):
+        unit = _UNITS.get(key, _ENDINGS.get(ending or ""))
+        if unit is not None:
             return unit
     return ""

@@ -33,7 +33,7 @@ from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import TrialStore
 
 STEP = "report"
-VERSION = 13
+VERSION = 14
 
 
 def report_folder(store: TrialStore) -> Path:

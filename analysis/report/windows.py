@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import pandas as pd
 
+from sliplab.analysis.metrics.alarm_rates import few_words
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report.alarms import alarm_words
@@ -77,7 +78,7 @@ class NetworkSection(Content):
     @property
     def strict(self) -> str:
         """Strict accuracy with its interval."""
-        return share_words(self.interval)
+        return warned_words(self.interval)
 
     @property
     def notices(self) -> Sequence[str]:
@@ -413,6 +414,12 @@ def share_words(row: Share) -> str:
     if row.share is None or row.low is None:
         return percent(row.share)
     return f"{percent(row.share)} ({percent(row.low)} to {percent(row.high)})"
+
+
+def warned_words(row: Share) -> str:
+    """Return a share with its interval, and a warning where so few trials bound it badly."""
+    few = "" if row.low is None else few_words(row.trials, "errors")
+    return "; ".join(filter(None, (share_words(row), few)))
 
 
 def points_words(row: Share) -> str:

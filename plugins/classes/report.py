@@ -27,6 +27,7 @@ from sliplab.analysis.report.windows import (
     share_data,
     share_words,
     training_figure,
+    warned_words,
     work_section,
 )
 from sliplab.plugins.classes import plot
@@ -321,7 +322,7 @@ def _network_section(summary: ClassSummary, fitted: Fitted) -> ClassNetworkSecti
         ),
         Table(["seed", "validation, strict", "test, argmax", "test, strict"], seeds),
         _argmax_words(scores),
-        share_words(scores.interval),
+        warned_words(scores.interval),
         share_words(trials.argmax),
         share_words(trials.strict),
     )

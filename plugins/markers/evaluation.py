@@ -101,7 +101,7 @@ def wanted_marker_models(labels: StoreLabels, campaigns: list[Collected]) -> lis
 
 
 def train_marker_model(
-    model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples
+    model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples, *, simulated: bool
 ) -> MarkerNet:
     """Train one seed and keep it; the document is written last and marks it as complete.
 
@@ -124,6 +124,7 @@ def train_marker_model(
         validation=ValidationAccuracy(
             argmax=found.argmax, strict=found.strict, margin=found.margin
         ),
+        simulated=simulated,
     )
     write_json(model.info_path, info.to_json())
     return net

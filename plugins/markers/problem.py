@@ -48,7 +48,8 @@ class SlipByMarkers(Problem):
         self, model: ModelOnDisk, train: MarkerSamples, validation: MarkerSamples, watch: Watch
     ) -> list[str]:
         """See `Problem`."""
-        net = evaluation.train_marker_model(model, train, validation)
+        simulated = self.labels.store.simulated
+        net = evaluation.train_marker_model(model, train, validation, simulated=simulated)
         strict = model.info.validation.strict
         shown = "" if strict is None else f", validation {100 * strict:.1f} %"
         return [f"{model.title}: {net.title}; epoch {net.chosen_epoch}{shown}"]

@@ -21,8 +21,8 @@ from sliplab.analysis.report.windows import (
     class_table,
     confusion_figure,
     points_words,
-    share_words,
     training_figure,
+    warned_words,
     where_section,
 )
 from sliplab.plugins.markers import marker_net
@@ -108,7 +108,7 @@ class MarkerNetworkSection(Content):
     @property
     def strict(self) -> str:
         """Strict accuracy with its interval."""
-        return share_words(self.interval)
+        return warned_words(self.interval)
 
 
 def _frames(smoothing: int) -> str:

@@ -115,23 +115,26 @@ def label_table(store: TrialStore, campaign: str, trials: list[str]) -> pd.DataF
     """Return one row a labelled trial: the single values of its label, times in integer ns.
 
     Nested values become columns with a dot in their names; lists are left out. Values that are not
-    in every label are missing, and integers stay integers.
+    in every label are missing, and integers stay integers. `simulated` is a column of every row.
     """
     stored = Derived.of(store, LABELS, campaign)
+    simulated = any(item.info["simulated"] for item in store.campaigns() if item.name == campaign)
     rows: list[Json] = []
     for trial in trials:
         try:
             found = stored.read(trial)
         except FileNotFoundError:
             continue
-        rows.append({"campaign": campaign, "trial": trial, **_flat(found, "")})
+        flat = {**_flat(found, ""), "simulated": simulated}
+        rows.append({"campaign": campaign, "trial": trial, **flat})
     return pd.DataFrame(rows).convert_dtypes()
 
 
 def sample_table(recordings: Iterable[Recording], stream: str) -> pd.DataFrame:
     """Return one row a sample of a stream: its trial, its time on the time line (ns), its values.
 
-    Values with several components become columns with a number in their names.
+    Values with several components become columns with a number in their names. The last column is
+    `simulated`.
 
     Raises:
         StoreError: a trial has no such stream.
@@ -144,7 +147,7 @@ def sample_table(recordings: Iterable[Recording], stream: str) -> pd.DataFrame:
         for part, values in samples.items():
             for index, component in enumerate(values.reshape(len(times), -1).T):
                 columns[part if values.ndim == 1 else f"{part}_{index}"] = component
-        tables.append(pd.DataFrame(columns))
+        tables.append(pd.DataFrame({**columns, "simulated": recording.simulated}))
     return pd.concat(tables, ignore_index=True)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sliplab.storage.schema.document import Document, Int, Number, Part
+from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
 
 
 class ModelSamples(Part):
@@ -30,3 +30,5 @@ class TrainedModel(Document):
     chosen_epoch: Int
     validation: ValidationAccuracy
     warnings: tuple[str, ...] = ()
+    simulated: Bool | None = None
+    """Some of its windows are of simulated trials; null in older models."""

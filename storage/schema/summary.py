@@ -149,6 +149,8 @@ class RuleSettings(Part):
     margin: Number
     choose: str = "protocol"
     """Source of both: `protocol`, `validation` or `test`."""
+    false_early_ms: Number | None = None
+    """A detection earlier than the onset by more is false."""
 
 
 class NetworkSummary(Part):

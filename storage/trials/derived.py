@@ -8,7 +8,9 @@ Raw data are never touched, and the whole folder may be deleted at any time.
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,18 +50,29 @@ def load_document(path: Path, kind: type[DocumentT]) -> DocumentT:
         raise StoreError(f"{error}; it is damaged: delete it, and its step recomputes it") from None
 
 
+def _any_simulated(store: TrialStore, campaign: str | None) -> bool:
+    of = (item for item in store.campaigns() if campaign in (None, item.name))
+    return any(bool(item.info["simulated"]) for item in of)
+
+
 @dataclass(frozen=True)
 class Derived:
-    """The results of one step."""
+    """The results of one step.
+
+    Attributes:
+        of_simulated: whether what they are made of is simulated, as of now; None where unknown.
+    """
 
     folder: Path
+    of_simulated: Callable[[], bool] | None = field(default=None, compare=False, repr=False)
 
     @staticmethod
     def of(store: TrialStore, step: str, campaign: str | None = None) -> Derived:
         """Return the results of `step`; those about single trials are under their campaign."""
         folder = store.folder / "derived" / safe_name(step)
         folder = folder if campaign is None else folder / safe_name(campaign)
-        return Derived(inside(folder, store.folder))
+        simulated = partial(_any_simulated, store, campaign)
+        return Derived(inside(folder, store.folder), simulated)
 
     def key(self, name: str) -> str | None:
         """Return the key that the result `name` was made with; None if there is none."""
@@ -74,14 +87,18 @@ class Derived:
 
     @uninterrupted
     def write(self, name: str, key: str, data: Json | Part, arrays: Arrays | None = None) -> None:
-        """Keep a result; the JSON with its key is written last and decides."""
+        """Keep a result; the JSON with its key is written last and decides.
+
+        It also says if it is of simulated trials.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         if arrays is not None:
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]  # no array is numpy's option
             write_bytes(self.arrays_path(name), buffer.getvalue())
         plain = data.to_json() if isinstance(data, Part) else data
-        write_json(self.folder / f"{safe_name(name)}.json", {**plain, "key": key})
+        mark = {} if self.of_simulated is None else {"simulated": self.of_simulated()}
+        write_json(self.folder / f"{safe_name(name)}.json", {**mark, **plain, "key": key})
 
     def read(self, name: str) -> Json:
         """Return a result's JSON.

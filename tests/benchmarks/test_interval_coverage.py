@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.interval_coverage import CLUSTERS, IntervalCoverage, alarm_rates, medians_by_world
+from benchmarks.interval_coverage import (
+    CLUSTERS,
+    IntervalCoverage,
+    alarm_rates,
+    differences_of_counts,
+    medians_by_world,
+    shares_of_windows,
+)
 
 DRAWS = [100, pytest.param(1000, marks=pytest.mark.long)]
 """Data sets of each case: few, which finds what is far off, and as many as the tables have."""
@@ -41,3 +48,17 @@ def test_rate_of_few_clusters_is_held_as_often_as_documented(rates: list[Interva
 @pytest.mark.parametrize("draws", DRAWS)
 def test_median_over_worlds_is_held_in_95_percent(draws: int) -> None:
     assert [row for row in medians_by_world(draws, sizes=(6, 16)) if not holds(row)] == []
+
+
+@pytest.mark.parametrize("draws", DRAWS)
+def test_share_of_windows_is_held_as_often_as_documented(draws: int) -> None:
+    rows = list(shares_of_windows(draws, sizes=(6, 132)))
+    bad = [row for row in rows if "30 %" in row.case and row.clusters == 6]
+    assert [row for row in rows if row not in bad and not holds(row)] == []
+    assert [row.share for row in bad if row.share < 0.5], "in three of four sets no trial fails"
+
+
+@pytest.mark.parametrize("draws", DRAWS)
+def test_difference_of_counts_is_held_at_least_as_often_as_said(draws: int) -> None:
+    rows = differences_of_counts(draws, sizes=(6, 36))
+    assert [row for row in rows if row.span[1] < 0.93] == []

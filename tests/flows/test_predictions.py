@@ -157,6 +157,10 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
         lambda t: t.drop(columns=SPIKES).assign(no_slip=2.0, incipient=0.0, gross=0.0),
         "must be from 0 to 1",
     ),
+    "sum": (
+        lambda t: t.drop(columns=SPIKES).assign(no_slip=0.8, incipient=0.5, gross=0.3),
+        "must be from 0 to 1, and add up to 1; not so in ",
+    ),
 }
 
 

@@ -494,10 +494,14 @@ def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Trial
     assert compare(ours, theirs).to_json()["settings"] == [
         {"what": "versions.numpy", "here": ours.versions["numpy"], "there": "0"}
     ]
-    # trials of another protocol only have the same names
-    hashes = changed(theirs.protocols["tiny_gravity"], collection="another")
-    theirs = changed(theirs, protocols={**theirs.protocols, "tiny_gravity": hashes})
-    assert {row.name: row for row in compare(ours, theirs).figures}[mean].basis == "trials"
+    # trials of another protocol only have the same names, and vary as well
+    hashes = {name: changed(of, collection="another") for name, of in theirs.protocols.items()}
+    found = {row.name: row for row in compare(ours, changed(theirs, protocols=hashes)).figures}
+    assert found[mean].basis == "trials"
+    both = found["accuracy, strict, mean of seeds"]
+    assert (both.basis, both.beyond) == ("seeds and trials", False)
+    assert both.low < strict.low < strict.high < both.high
+    assert found["accuracy, margin, mean of seeds"].beyond is None, "without an interval over them"
 
 
 def test_compared_medians_count_late_detections(store: TrialStore) -> None:

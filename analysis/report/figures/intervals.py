@@ -58,13 +58,18 @@ def by_condition(
         )
         rng = np.random.default_rng(0)
         for axes, panel in zip(grid[0], panels, strict=True):
+            room = _room(panel)
             for place, row in enumerate(rows):
                 there = np.asarray(panel.values.get(row, ()), np.float64)
                 spread = rng.uniform(-0.2, 0.2, len(there))
                 axes.plot(there, place + spread, "o", ms=2.6, color=panel.colour, alpha=0.6, mew=0)
                 if len(there):
                     span = interval(there, least=panel.least) or (np.nan, np.nan)
-                    axes.plot(span, [place, place], color="black", lw=1.6)
+                    bar = np.clip(span, *room)
+                    axes.plot(bar, [place, place], color="black", lw=1.6)
+                    for end, drawn, arrow in zip(span, bar, "<>", strict=True):
+                        if abs(end - drawn) > 0:  # of no interval both are NaN
+                            axes.plot(drawn, place, arrow, color="black", ms=4, clip_on=False)
                     axes.plot(there.mean(), place, "D", color="black", ms=3.8)
                 note = panel.notes.get(row, "" if len(there) else "none")
                 if note:
@@ -91,7 +96,7 @@ def by_condition(
             axes.set_title("\n".join(lines), fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)
-            axes.set_xlim(*_room(panel))
+            axes.set_xlim(*room)
             if not any(len(panel.values.get(row, ())) for row in rows):
                 axes.set_xticks([])  # no scale is read where nothing is drawn
                 axes.annotate(
@@ -109,7 +114,7 @@ def by_condition(
 
 
 def _room(panel: Panel) -> tuple[float, float]:
-    """Limits of a panel: all trials; the wide interval of a few trials is cut off."""
+    """Limits of a panel: all trials; the wide interval of a few is cut off, with an arrow."""
     shown = [value for values in panel.values.values() for value in values]
     shown += [0.0] if panel.zero else []
     shown += [] if panel.limit is None else [panel.limit[0]]

@@ -93,6 +93,12 @@ def view(result: DetectorTradeoff) -> dict[str, object]:
             "seeds": max(len(row.seeds) for row in rows),
             "lines": _lines(comparisons, simulated),
             "factors": _factors(comparisons),
+            "compared": sum(
+                item.difference[name].low is not None
+                for _, item in comparisons
+                if item.difference is not None and not item.paper
+                for name in _SHOWN
+            ),
             "cross": _cross(rows),
             "pairs": _pairs(result.pairs),
         }
@@ -139,15 +145,18 @@ def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
     return Figure(factor_lines(bars, figures, simulated=simulated))
 
 
+_POINTS = (100, "points")
+_SHOWN = {"strict": _POINTS, "mean_ms": (1, "ms"), "false_early_either": _POINTS}
+"""Figures whose differences are shown, with their scale and unit."""
+
+
 def _factors(comparisons: Comparisons) -> Table:
-    points = (100, "points")
-    compared = {"strict": points, "mean_ms": (1, "ms"), "false_early_either": points}
     table = []
     for row, item in comparisons:
         found = item.difference
         shown = ["paper's" if item.paper else "–"] * 3
         if found is not None and not item.paper:
-            shown = [format_difference(found[name], *how) for name, how in compared.items()]
+            shown = [format_difference(found[name], *how) for name, how in _SHOWN.items()]
         means = [spread(row.test["strict"], 100, 1), spread(row.test["mean_ms"], 1, 0)]
         table.append([f"{FACTORS[item.factor]}: {_level(item)}", *means, *shown])
     columns = (

@@ -14,6 +14,7 @@ from scipy import stats
 from sliplab.analysis.metrics.intervals import (
     STATISTICS,
     between_seeds,
+    count_difference,
     difference,
     drawn,
     exact_interval,
@@ -112,6 +113,38 @@ def test_a_difference_of_shares_is_held_as_often_as_said(n: int) -> None:
 
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("paired", [False, True])
+@pytest.mark.parametrize("n", SOME)
+@pytest.mark.parametrize(("p", "q"), [(0.02, 0.0), (1.0, 0.95), (0.1, 0.1), (0.3, 0.4)])
+def test_difference_of_counts_of_trials_is_held(p: float, q: float, n: int, paired: bool) -> None:
+    """Of the same trials half are alike for what they share."""
+
+    def measure(rng: np.random.Generator) -> Any:
+        a, b = rng.random((2, n))
+        b = np.where(paired & (rng.random(n) < 0.5), a, b)
+        return count_difference(a < p, b < q, paired=paired)
+
+    assert coverage(measure, p - q, n) >= 0.92
+
+
+def test_difference_of_counts_is_newcombes() -> None:
+    """Newcombe 1998, table II (a) and (b): 56 of 70 less 48 of 80, 9 of 10 less 3 of 10."""
+    for (x, n), (y, m), known in (
+        ((56, 70), (48, 80), (0.0524, 0.3339)),
+        ((9, 10), (3, 10), (0.1705, 0.8090)),
+    ):
+        first, second = np.arange(n) < x, np.arange(m) < y
+        assert count_difference(first, second) == pytest.approx(known, abs=1e-4)
+    # pairs that agree as often as by chance are two sets; those that agree more bound it more
+    a, b, c = np.repeat([[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]], 10, axis=0).T
+    assert count_difference(a, b, paired=True) == count_difference(a, b)
+    paired, free = (np.ptp(count_difference(a, c, paired=it)) for it in (True, False))
+    assert 0 < paired < free / 2
+    with pytest.raises(ValueError, match="0 or 1"):
+        count_difference([0.5], [1.0])
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("paired", [False, True])
 def test_a_difference_of_medians_is_held_at_least_as_often_as_said(paired: bool) -> None:
     def measure(rng: np.random.Generator) -> Any:
         shared = rng.gamma(3, 25, 12) * paired
@@ -171,8 +204,30 @@ def test_two_sets_differ_as_welch_says() -> None:
         assert difference(a, b) == pytest.approx((welch.low, welch.high))
 
 
+@pytest.mark.parametrize(
+    "found",
+    [
+        difference(LATE + 30.0, LATE, paired=True),
+        difference([10.0, 10.0], [20.0, 20.0]),
+        share_difference(([50.0, 50.0], [50.0, 50.0]), ([0.0, 0.0], [50.0, 50.0])),
+        between_seeds([0.1, 0.1, 0.1], [0.3, 0.3]),
+    ],
+)
+def test_equal_trials_bound_no_difference(found: object) -> None:
+    assert found is None
+
+
+def test_intervals_of_several_differences_hold_at_once() -> None:
+    """Of six differences without an effect none excludes zero in 95 % of sets."""
+    rng = np.random.default_rng(3)
+    sets = rng.normal(0, 20, (1000, 6, 2, 4))
+    for comparisons, low, high in ((1, 0.65, 0.85), (6, 0.93, 0.97)):
+        spans = [[difference(*x, comparisons=comparisons) for x in six] for six in sets]
+        at_once = np.mean([all(a <= 0 <= b for a, b in six) for six in spans])
+        assert low < at_once < high
+
+
 def test_pairs_know_what_they_have_in_common() -> None:
-    assert difference(LATE + 30.0, LATE, paired=True) == (pytest.approx(30.0), pytest.approx(30.0))
     other = LATE + RNG.normal(3.0, 5.0, len(LATE))
     known = stats.ttest_rel(other, LATE).confidence_interval()
     assert difference(other, LATE, paired=True) == pytest.approx((known.low, known.high))
@@ -311,6 +366,9 @@ def test_difference_of_medians_counts_infinite_values() -> None:
     found = difference(lost, LATE, "median", paired=True)
     assert found[0] > 0, "as many slow ones as were lost"
     assert difference(np.r_[LATE[:80], np.full(100, np.inf)], LATE, "median") is None
+    # where a draw loses both medians, their difference may be anything
+    few = np.r_[LATE[:7], np.full(5, np.inf)]
+    assert difference(few + 10.0, few, "median", paired=True) is None
     with pytest.raises(ValueError, match="infinite"):
         difference(lost, LATE)
 
@@ -322,6 +380,8 @@ def test_interval_stops_at_the_least_that_can_be(statistic: str) -> None:
     assert free[0] < 0
     bounded = interval([value - 30 for value in values], statistic, least=0.0)
     assert bounded == (0.0, max(free[1], 0.0))
+    lost = interval([600.0, 610.0, 650.0, 700.0, 720.0, 800.0, -np.inf, -np.inf], "median", 0.0)
+    assert lost[0] == -np.inf, "an open end is no measured one"
 
 
 def test_cluster_of_a_stratum_alone_has_the_variance_of_its_count() -> None:

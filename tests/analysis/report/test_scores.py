@@ -68,6 +68,35 @@ def test_figures_have_their_unit_and_count(summary: dict[str, Any]) -> None:
     assert counts.unit.tolist() == [""]
 
 
+@pytest.mark.parametrize(
+    ("number", "figure", "unit"),
+    [
+        ({"rates": [{"asked": 0.01, "choice": 4}]}, "rates.choice", ""),
+        ({"rates": [{"asked": 0.01, "levels": {"gross": 48.5}}]}, "rates.levels.gross", ""),
+        (
+            {"rates": {"by_reference": {"true": {"unsure": 2}}}},
+            "rates.by_reference.true.unsure",
+            "",
+        ),
+        ({"curve": [{"allowed": 1, "rate": 0.1}]}, "curve.rate", "share"),
+        ({"rates": {"iaf1": 0.1}}, "rates.iaf1", "share"),
+        ({"force": {"rmse_n": 0.2}}, "force.rmse_n", "N"),
+        ({"force": {"rmse_n": {"each": 0.2}}}, "force.rmse_n.each", "N"),
+    ],
+)
+def test_units_are_of_the_key_that_has_one(number: dict[str, Any], figure: str, unit: str) -> None:
+    table = score_table({"simulated": True, **number}, {}, {"rmse_n": "N"}, {"force": "validation"})
+    (row,) = table.to_dict("records")
+    assert (row["figure"], row["unit"]) == (figure, unit)
+    assert row["split"] == ("validation" if "force" in number else "")
+
+
+def test_shares_are_no_counts(summary: dict[str, Any]) -> None:
+    table = rows_of(score_table(summary), unit="share")
+    assert len(table) > 50
+    assert (table.value.dropna().abs() <= 1).all()
+
+
 def test_parts_of_a_key_that_are_columns_are_not_in_the_figure() -> None:
     share = {"share": 0.5, "low": 0.4, "high": None, "n": 8, "trials": 2}
     table = score_table(

@@ -12,6 +12,7 @@ from sliplab.analysis.detectors.latency import summarise_latency, summarise_lead
 from sliplab.analysis.metrics.alarm_rates import alarm_rate
 from sliplab.analysis.report.latency import smallest_lead
 from sliplab.analysis.report.outcomes import trial_intervals
+from sliplab.analysis.report.page import with_interval
 from sliplab.analysis.report.seeds import seed_words
 from sliplab.analysis.report.tiles import slip_tiles
 from sliplab.protocols.detection import Detection
@@ -139,11 +140,20 @@ def test_missed_trials_count_in_medians_and_their_intervals(lost: int) -> None:
     assert spans.lead_ms.median is not None
     assert spans.latency_incipient_ms.median is not None
     if lost > 1:
-        assert spans.lead_ms.median[0] == 0.0, "no lead at all is as far as it goes"
+        assert spans.lead_ms.median[0] is None, "no lower bound"
         assert spans.latency_incipient_ms.median[1] is None, "no upper bound"
     # gross slip was late in as many of the trials as were missed
     gross = summarise_latency([latency(row) for row in rows]).gross
     assert (gross.n, gross.late, gross.median) == (7, lost, 20.0)
+
+
+def test_median_of_lost_detections_alone_has_no_interval() -> None:
+    spans = trial_intervals([outcome("gravity", None, "missed")] * 6)
+    assert spans.lead_ms.median is spans.latency_incipient_ms.median is None
+
+
+def test_open_end_of_an_interval_has_its_sign() -> None:
+    assert with_interval(600.0, (None, None), 0, "ms") == "600 (-∞ to ∞) ms"
 
 
 def test_median_of_half_lost_detections_is_none() -> None:

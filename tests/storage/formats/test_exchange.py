@@ -375,6 +375,7 @@ def test_labels_and_catalogue_as_tables(store: TrialStore, tmp_path: Path) -> No
     found = pd.read_parquet(tmp_path / "l.parquet")
     assert found["gross_ns"].tolist() == [late]
     assert found["doubt.glare"].tolist() == [False]
+    assert found["simulated"].tolist() == [store.simulated]
     with pytest.raises(InputError, match="must end in"):
         write_table(table, tmp_path / "t.xlsx")
 

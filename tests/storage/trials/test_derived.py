@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import TrialStore
 
@@ -30,3 +32,21 @@ def test_a_damaged_result_is_stale(tmp_path: Path) -> None:
     results.write("t", "k", {})
     (results.folder / "t.json").write_text("{")
     assert not results.fresh("t", "k")
+
+
+@pytest.mark.parametrize(
+    ("campaign", "simulated"), [("mock", True), ("real", False), (None, True), ("other", False)]
+)
+def test_a_result_of_simulated_trials_says_so(
+    tmp_path: Path, campaign: str | None, simulated: bool
+) -> None:
+    store = TrialStore.create(tmp_path)
+    for name in ("mock", "real"):
+        make_folder(tmp_path / "campaigns" / name)
+        info = {"name": name, "simulated": name == "mock"}
+        write_json(tmp_path / "campaigns" / name / "campaign.json", info)
+    results = Derived.of(store, "labels", campaign)
+    results.write("t", "k", {"onset": 5})
+    assert results.read("t") == {"key": "k", "onset": 5, "simulated": simulated}
+    results.write("t", "k", {"simulated": None})
+    assert results.read("t")["simulated"] is None, "its own word counts"
