@@ -56,22 +56,28 @@ def slip_answer(summary: Summary | OneCameraSummary) -> Answer:
         found: Experiment | None = getattr(summary, name)
         if found is None or not found.accounted.planned:
             continue
+        accounts = found.accounted
+        lacking = accounts.not_taken + accounts.not_evaluated
+        planned = plural(accounts.planned, "test trial")
+        if lacking == accounts.planned:
+            sentences.append(f"{title}: none of {planned} was taken and evaluated.")
+            continue
         trials = [row for row in summary.trials if row.experiment == name]
         groups[f"{name}, n = {len(trials)}"] = trials
         latency, spans = found.latency_ms.incipient, found.intervals
         late = with_interval(latency.median, spans.latency_incipient_ms.median, 0, "ms")
         lead = with_interval(found.lead_ms.median, spans.lead_ms.median, 0, "ms")
         sentences.append(
-            f"{title}: {found.accounted.detected_first} of "
-            f"{plural(found.accounted.planned, 'test trial')} detected before gross slip. "
+            f"{title}: {accounts.detected_first} of {planned} detected before gross slip"
+            f"{f' ({lacking} not taken or evaluated)' if lacking else ''}. "
             f"Medians (95 % intervals): {late} after the onset, {lead} before gross slip."
         )
     if not groups:
-        return Answer((), None)
+        return Answer(sentences or ["There is no test trial: nothing was tested."], None)
     shown, rules = (TIMES[1], TIMES[3]), list(summary.detection.values())
     return Answer(
         sentences,
-        draw_times(groups, shown, (), rules, "answer", summary.simulated),
+        draw_times(groups, shown, (), "answer", rules, summary.simulated),
         "Time from the labelled onset of incipient slip to its detection (left), and from there to "
         "gross slip (right). A dot is a trial, the diamond the mean, the bar its 95 % interval (an "
         "arrow: cut off); at the right end trials without a value, and why.",

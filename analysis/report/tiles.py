@@ -61,12 +61,13 @@ def _accuracy(kinematic: Kinematic) -> Number:
 def _alarms(kinematic: Kinematic) -> Number:
     quiet = kinematic.false_alarms.get(QUIET)
     disturbed = kinematic.false_alarms.get(DISTURBED)
+    sure = "no interval" if quiet is None or quiet.high is None else "95 %"
     held = "" if quiet is None else f", {plural(quiet.clusters, 'trial')}, {quiet.hours:.3f} h"
     under = f"not measured ({COMMAND})" if disturbed is None else rate_words(disturbed)
     return Number(
         "false alarms an hour",
         rate_words(quiet),
-        f"in quiet holding (95 %){held}; under nuisances {under}",
+        f"in quiet holding ({sure}){held}; under nuisances {under}",
     )
 
 

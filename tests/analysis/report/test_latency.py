@@ -45,7 +45,7 @@ def test_an_interval_is_the_same_in_summary_table_and_figure(
     found = Levels(np.random.default_rng(0))
     found._rows = [(row, {"depth": "1 mm"}) for row in trials]
     of_all = trial_intervals(trials, RULES)
-    latency.draw_times({"all": trials}, TIMES, (), RULES, "figure", True)
+    latency.draw_times({"all": trials}, TIMES, (), "figure", RULES, True)
     cells = latency._by_level(found, "depth", RULES).rows[0]
     for name, panel, cell in zip(TIMES, drawn, cells[2:], strict=True):
         low, high = of_all.of(name).mean
