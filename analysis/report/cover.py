@@ -60,7 +60,7 @@ def slip_answer(summary: Summary | OneCameraSummary) -> Answer:
         lacking = accounts.not_taken + accounts.not_evaluated
         planned = plural(accounts.planned, "test trial")
         if lacking == accounts.planned:
-            sentences.append(f"{title}: none of {planned} was taken and evaluated.")
+            sentences.append(f"{title}: {planned} planned, none taken and evaluated.")
             continue
         trials = [row for row in summary.trials if row.experiment == name]
         groups[f"{name}, n = {len(trials)}"] = trials
