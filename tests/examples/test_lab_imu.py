@@ -183,6 +183,6 @@ def test_exported_as_a_table(taken: Recording, tmp_path: Path) -> None:
     check_export(request).write(request)
     table = pd.read_parquet(output)
     values = [f"acceleration_{axis}" for axis in range(3)]
-    assert list(table) == ["trial", "t_ns", *values, "temperature"]
+    assert list(table) == ["trial", "t_ns", *values, "temperature", "simulated"]
     assert (table[values] == GRAVITY).all(axis=None)
     assert table["t_ns"].tolist() == taken.samples("imu")["t"].tolist()

@@ -29,8 +29,7 @@ def test_the_difference_is_over_the_same_trials() -> None:
     # in each trial the second network has one window less
     found = behind(judged([0, 1, 2, 0, 1, 3]), judged([0, 1, 3, 0, 3, 3]))
     assert found.share == pytest.approx(2 / 6)
-    assert found.low == pytest.approx(2 / 6)
-    assert found.high == pytest.approx(2 / 6)
+    assert found.low is found.high is None  # equal differences say nothing of other trials
     other = behind(judged([0, 1, 2, 0, 1, 2]), judged([0, 1, 2, 3, 3, 3]))
     assert other.share == pytest.approx(0.5)
     assert other.low is not None
