@@ -13,7 +13,7 @@ from sliplab.protocols.quantity import (
 from sliplab.protocols.yaml_file import StrictModel, rule
 
 MAX_CREEP_MM_S = 1.0
-"""Highest speed towards a surface that is searched for: the arm goes on while a touch is noticed,
+"""Highest speed towards a surface that is searched for: the arm continues while a touch is noticed,
 deeper than the limits at a higher one, and depth zero is off by as much."""
 
 

@@ -43,7 +43,7 @@ ALONE = (
     *("unshare", "--user", "--map-user=65534", "--ipc", "--pid", "--fork", "--kill-child"),
     "--mount-proc",
 )
-"""Runs a command as nobody, with the files of this user, that sees no process but its own."""
+"""Runs a command that sees no process but its own, with the files of this user."""
 _FAILED, _JSON, _EVIDENCE = b"f", b"j", b"e"
 _TIME = struct.Struct("<d")
 

@@ -3,8 +3,8 @@
 Each detector runs in a process of its own, which is given events chunk by chunk. All choices are
 made by `prepare`, which has no test scene. A detector's figures are stored as soon as they are
 complete, so that a stopped run of a given seed resumes with the next detector. A seed that is drawn
-is in memory alone until the run ends: only detectors that nobody could fit to its worlds are judged
-on them.
+is in memory alone until the run ends: only detectors that could not be fitted to its worlds are
+judged on them.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 OR_BUSY = "; or this computer is too busy"
-"""Other cause of data that do not come: the two cannot be told apart."""
+"""Another cause of missing data: the two cannot be distinguished."""
 
 
 class HostClock:

@@ -259,7 +259,7 @@ class ServedRuns:
 
 
 def _is_later(run: Any, stop: ControlRequest) -> bool:
-    """Return whether a run was surely created after a stop; `when` is told to a second."""
+    """Return whether a run was surely created after a stop; `when` is in whole seconds."""
     try:
         when = datetime.fromisoformat(stop.when)
         after = latest = when + timedelta(seconds=1)

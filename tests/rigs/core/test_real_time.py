@@ -31,7 +31,12 @@ def allowed() -> bool:
         return "rtprio" not in refused
 
 
-@pytest.mark.skipif(not allowed(), reason="the system does not allow real-time priority")
+needs_priority = pytest.mark.skipif(
+    not allowed(), reason="the system does not allow real-time priority"
+)
+
+
+@needs_priority
 def test_all_threads_come_first_and_children_do_not() -> None:
     done = threading.Event()
     other = threading.Thread(target=done.wait)
@@ -53,7 +58,7 @@ def test_all_threads_come_first_and_children_do_not() -> None:
     other.join()
 
 
-@pytest.mark.skipif(not allowed(), reason="the system does not allow real-time priority")
+@needs_priority
 def test_a_detectors_process_comes_after_the_program_that_stops_the_arm() -> None:
     """And only once it has worked: kernels are compiled in the first call."""
     ours, theirs = multiprocessing.Pipe()
